@@ -46,8 +46,16 @@ def interval(inside: int, count: int) -> tuple[float, float]:
 
 
 def main() -> None:
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     picture, *runs = sys.argv[1:]
-    found = [deviations(run) for run in runs]
+    try:
+        found = [deviations(run) for run in runs]
+    except KeyError as error:
+        sys.exit(
+            f"metrics.json: expected the figures of fits by Gauss-Newton that learned E and nu, found one without {error}; "
+            "where a run does not know the truth, RUN=E,nu"
+        )
     for name, z, stated in found:
         print(
             f"| {name} | {z['E']:+.1f} | {100 * stated['E']:.1f} % | {z['nu']:+.1f} | {stated['nu']:.3f} |"

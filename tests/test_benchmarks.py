@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,6 +128,16 @@ def test_fits_of_cues_make_a_table(monkeypatch, tmp_path, capsys):
         == "| ball | prior=stvk | 1.3 | 1.3 | 1.26 | 1.3 | 1.26 |  | 1 | 1.26 | 1.260 | 1.26 | 1.26 | 1 |"
     )
     assert len({row.count("|") for row in rows}) == 1
+
+
+def test_coverage_needs_runs_with_standard_deviations(monkeypatch, tmp_path):
+    """A fit by Adam has none."""
+    (tmp_path / "metrics.json").write_text('{"id/E": 1e5, "id/nu": 0.3}')
+    runs = [str(tmp_path / "a.png"), f"{tmp_path}=1e5,0.3"]
+    for words, said in ([], "PICTURE RUN"), (runs, "fits by Gauss-Newton"):
+        monkeypatch.setattr("sys.argv", ["coverage.py", *words])
+        with pytest.raises(SystemExit, match=said):
+            runpy.run_path(str(BENCHMARKS / "coverage.py"), run_name="__main__")
 
 
 def test_a_profile_ends_where_the_misfit_has_risen(monkeypatch):

@@ -109,6 +109,12 @@ def run(options: argparse.Namespace) -> int:
     results = options.results or (options.runs / "results" if options.quick else RESULTS)
     if options.dry_run:
         return 0
+    if options.collect:  # the tables of the others stay
+        experiments = [e for e in experiments if any(job.finished for job in planned[e.name])]
+        if not experiments:
+            raise ConfigError(
+                f"--collect: expected a complete job of {', '.join(planned)} in {options.runs}, found none; --runs names the folder"
+            )
     made_folder(options.runs, "--runs")
     made_folder(results, "--results")
     command, failed = shown(options), {}

@@ -201,6 +201,13 @@ def rehearse(values: Mapping[str, Any] | TrainSettings) -> list[Stage]:
             adapter = fitting(build_adapter(settings.adapter.plain()), material.law)
         check_known(settings.identification.known, material, adapter)
     stages = build_stages(settings.fit, heterogeneity, adapter, bool(material.candidates))
+    criterion, marked = settings.criterion.name, settings.scene.plain().get("format") == "markers"
+    free = criterion == "free" or marked or all(stage.calibrates for stage in stages)
+    if settings.simulation.adaptive and not free:
+        raise ConfigError(
+            f"simulation.adaptive: expected criterion=free beside it, found criterion={criterion}: predictions that are corrected "
+            "in every frame have fixed substeps"
+        )
     weights = settings.losses.weights()
     check_terms(weights, adapter)
     if not any(weights[name] for name in ("image", "mask", "flow", "rotation", "stretch", "position")):  # fmt: skip

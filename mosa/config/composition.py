@@ -146,6 +146,10 @@ def compose(*overrides: str, name: str = "train") -> DictConfig:
     Imports the modules of `extensions`, as the commands do.
 
     Errors: ConfigError for an override that Hydra does not know, or an extension."""
+    if wrong := [each for each in overrides if not isinstance(each, str)]:
+        raise ConfigError(
+            f"overrides: expected texts, as compose('scene=rabbit', 'seed=1'), found {wrong[0]!r}; of a list: compose(*list)"
+        )
     try:
         with initialize_config_dir(configuration(), version_base="1.3"):
             cfg = hydra_compose(name, overrides=list(overrides))
@@ -165,5 +169,6 @@ def composed(
                 f"overrides: expected none beside a whole configuration, found {overrides}; give them to mosa.compose"
             )
         return first if isinstance(first, DictConfig) else OmegaConf.create(dict(first))
-    given = () if first is None else (first if "=" in first else f"{GROUPED}={first}",)
+    named = isinstance(first, str) and "=" not in first
+    given = () if first is None else (f"{GROUPED}={first}" if named else first,)
     return compose(*given, *overrides)

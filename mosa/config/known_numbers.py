@@ -66,7 +66,10 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
         build = adapter_class(run.sections.adapter.plain())
         inflation, alike = INFLATION, build is not None and build is type(adapter)
     if record is None:
-        raise DataError(f"{where}: {path}: expected the checkpoint of an ended fit, found none")
+        raise DataError(
+            f"{where}: {path}: expected the checkpoint of an ended fit by Gauss-Newton, whose standard deviations are read, "
+            "found one without (a fit by Adam has none)"
+        )
     count = adapter.numbers.numel() if alike and adapter.few_numbers else 0
     learned = [*material.learned, *(f"operator[{k}]" for k in range(count))]
     posterior = Posterior.read(record.plain()).only(learned)

@@ -97,15 +97,17 @@ def uncertain(law: Law, fit: Fit) -> list[tuple[str, float, float | str, str]]:
             physical = form.physical(raw)
             (slope,) = torch.autograd.grad(physical, raw)
             unit, value = unit_of(law.material.law, name), physical.item()
+            deviation = abs(slope.item()) * sd
+            near = any(abs(value - b) < 0.01 * max(abs(b), 1) for b in (form.low, form.high))
+            unknown = f"not determined{' (at its bound)' if near else ''}"
             if name == "E" and fit.simulated is not None and "nu" not in fit.names:
                 nu = law.material.physical()["nu"].item()
                 for label, factor in (("mu", 1), ("3 mu (E at nu = 1/2)", 3)):
                     part = factor / 2 / (1 + nu)
-                    rows.append((label, part * value, part * slope.item() * sd, unit))
+                    told = part * deviation if sd < most else unknown
+                    rows.append((label, part * value, told, unit))
                 name = f"E (at the given nu = {nu:.4g})"
-            near = any(abs(value - b) < 0.01 * max(abs(b), 1) for b in (form.low, form.high))
-            unknown = f"not determined{' (at its bound)' if near else ''}"
-            rows.append((name, value, abs(slope.item()) * sd if sd < most else unknown, unit))
+            rows.append((name, value, deviation if sd < most else unknown, unit))
         else:
             told = sd if sd < most else "not determined"
             rows.append((name, value, told, "" if name.startswith("stiffness_") else "rad"))
@@ -191,7 +193,8 @@ def table(
         value, found = data.value[chosen], fit.predicted[chosen]
         out = f"{rms(left_out[name] - value) / scale:.3g}" if name in left_out else ""
         off, share = rms(found - value) / scale, explained(value, found)
-        lines.append(f"| {name} | {chosen.sum()} | {off:.3g} | {share:.3f} | {out} |")
+        told = "" if math.isnan(share) else f"{share:.3f}"
+        lines.append(f"| {name} | {chosen.sum()} | {off:.3g} | {told} | {out} |")
     return "\n".join(lines) + "\n"
 
 

@@ -39,8 +39,7 @@ def build_law(values: dict) -> Law:
         )
     adapter = build_adapter(values["adapter"])
     if adapter is not None and not isinstance(adapter, HyperelasticAdapter):
-        found = f"{values['adapter']['name']}: others have no energy"
-        raise ConfigError(f"adapter: expected operator or none, found {found}")
+        raise ConfigError("adapter: expected operator or none, found one without an energy")
     check_own(material)
     if adapter is None and values["incompressible"] and "nu" in material.raw:
         material.raw["nu"].requires_grad_(False)  # the pressure replaces it
@@ -57,7 +56,12 @@ def fit_tests(cfg: DictConfig) -> float:
             raise ConfigError(f"{key}: expected {expected}, found none")
     values, folder = plain(cfg), run_folder()
     load_extensions(values.get("extensions"))
-    MaterialSettings.read(values)
+    settings = MaterialSettings.read(values)
+    if settings.symmetry == "orthotropic" and values["adapter"]["name"] is None:
+        warn(
+            "symmetry: has no effect in this run: no stiffness is learned (adapter=operator)",
+            stacklevel=1,
+        )
     check_density("density", values["density"])
     data = read_tests(values["tests"], values["unit"])
     law, known = build_law(values), None

@@ -147,12 +147,12 @@ def test_mistakes_in_the_arguments_of_experiments_are_said_before_any_job(words,
         run(arguments(["table_time", *words, "--dry-run"]))
 
 
-def test_the_results_folder_is_tried_before_any_job():
+def test_the_results_folder_is_tried_before_any_job(tmp_path):
     with (
         contextlib.redirect_stdout(io.StringIO()),
         pytest.raises(ConfigError, match="--results: expected a folder that can be"),
     ):
-        run(arguments(["table_time", "--collect", "--results", "/proc/nowhere"]))
+        run(arguments(["table_time", "--runs", str(tmp_path), "--results", "/proc/nowhere"]))
 
 
 def test_the_viewer_listens_where_it_was_told_to_alone():

@@ -81,6 +81,14 @@ def test_a_mistyped_override_in_python_names_what_there_is(override, message):
     assert "use +" not in str(found.value)
 
 
+@pytest.mark.parametrize("made", [mosa.compose, mosa.LitMosa, mosa.SceneDataModule])
+def test_overrides_in_a_list_are_refused(made):
+    with pytest.raises(
+        ConfigError, match=r"overrides: expected texts.*of a list: compose\(\*list\)"
+    ):
+        made(["scene=tiny"])
+
+
 @pytest.mark.parametrize("adapter, message", [
     ({"name": "stress", "alpha": 2}, "adapter.alpha"),
     ({"name": "direct", "no_C": True}, "no_C"),
@@ -242,6 +250,17 @@ def test_forces_need_a_fit_that_compares_them(tmp_path):
         ConfigError, match=r"name of one collider or driven set \(there are none\), found 'grip'"
     ):
         rehearse(composed(world[1]))
+
+
+def test_adaptive_substeps_need_free_rollouts():
+    """Refused where the first stage after calibration began, after the reconstruction, in words of criterion=corrected alone."""
+    for criterion in ("corrected", "both"):
+        with pytest.raises(
+            ConfigError, match=f"criterion=free beside it, found criterion={criterion}"
+        ):
+            rehearse(composed("simulation.adaptive=true", f"criterion={criterion}"))
+    for free in (["criterion=free"], ["adapter=none", "heterogeneity.enabled=false"], ["scene=markers"]):  # fmt: skip
+        rehearse(composed("simulation.adaptive=true", *free))
 
 
 def test_what_another_experiment_says_is_read_before_anything_is_computed(tmp_path):

@@ -57,7 +57,7 @@ def test_a_script_of_one_s_own_hears_it_too(monkeypatch):
     (["ablation=no_rot", "adapter=none", "heterogeneity.enabled=false"], ["losses.rotation"]),
     (["ablation=no_rot", "adapter=none", "heterogeneity.enabled=false", "fit=adam"], []),
     (["losses.rotation=0", "losses.position=0", "adapter=none", "heterogeneity.enabled=false"], []),
-    (["scene=tiny", "simulation.adaptive=true", "simulation.min_substeps=3", "seed=3"], []),
+    (["scene=tiny", "simulation.adaptive=true", "criterion=free", "simulation.min_substeps=3", "seed=3"], []),
 ])  # fmt: skip
 def test_what_has_no_effect_is_said(overrides, expected):
     assert [key for key in found(*overrides)] == [each.split("=")[0] for each in expected]

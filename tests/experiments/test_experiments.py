@@ -588,6 +588,19 @@ def test_the_command_is_written_without_folders_of_this_machine():
     )
 
 
+def test_tables_of_which_no_job_is_complete_stay_as_they_are(tmp_path, capsys):
+    """`all --collect` in a clone emptied the tables of docs/results that had been run elsewhere."""
+    runs, results = tmp_path / "runs", tmp_path / "results"
+    options = ["--collect", "--runs", str(runs), "--results", str(results)]
+    with pytest.raises(ConfigError, match="--collect: expected a complete job of table_time in"):
+        run(arguments(["table_time", *options]))
+    assert not results.exists()
+    found = load_experiment(PAPER, "table_future")
+    write_metrics(jobs_of(found, runs)[0])
+    assert run(arguments(["table_future", "table_time", *options])) == 0
+    assert {path.stem for path in results.iterdir()} == {"table_future"}
+
+
 def test_errors_frame_by_frame_are_those_of_the_motions(tmp_path):
     found = replace(experiment(), seeds=(0,), analysis="long_term", plot=None)
     jobs = jobs_of(found, tmp_path / "runs")

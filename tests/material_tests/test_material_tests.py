@@ -386,6 +386,9 @@ def test_the_numbers_that_are_determined_are_those_of_the_table():
     told = {name: sd for name, _, sd, _ in uncertain(law, fit)}
     assert told["fibre_1"] == pytest.approx(0.1) and told["fibre_exponent"] == pytest.approx(2.9)
     assert told["fibre_2"] == "not determined"  # 166 degrees are any direction
+    fit = replace(fit, covariance=16 * np.eye(5), simulated=np.zeros(1))
+    told = {name: sd for name, _, sd, _ in uncertain(law, fit)}
+    assert told["mu"] == told["3 mu (E at nu = 1/2)"] == "not determined"
 
 
 def test_an_export_of_an_incompressible_fit_says_how_far_it_is(tmp_path):
@@ -504,8 +507,10 @@ def test_the_command_leaves_a_material_that_a_twin_reads(tmp_path):
 
 
 def test_what_cannot_be_fitted_is_said():
-    run = call("mosa/material_tests/__main__.py", "tests=none.csv", "unit=Pa", "prior=von_mises")
+    words = ("tests=none.csv", "unit=Pa", "prior=von_mises", "symmetry=orthotropic")
+    run = call("mosa/material_tests/__main__.py", *words)
     assert run.returncode != 0 and "none.csv" in run.stdout + run.stderr
+    assert "symmetry: has no effect in this run" in run.stdout + run.stderr
 
 
 def test_heart_muscle(reference_data):

@@ -40,11 +40,11 @@ UNITS = {
     "ssim_crop": ("SSIM crop", 1, 4),
 }
 METRICS = ("rms_m", "cd_m", "psnr_crop", "ssim_crop")
-FIGURES = (
-    "*rms*: root mean square distance of particles from their true places after contact; "
-    "*CD*: mean distance to the nearest true particle, plus that in the other direction; "
-    "*PSNR*, *SSIM*: likeness of pictures in a window around the body, more is better"
-)
+FIGURES = {
+    "rms_m": "*rms*: root mean square distance of particles from their true places after contact",
+    "cd_m": "*CD*: mean distance to the nearest true particle, plus that in the other direction",
+    "psnr_crop": "*PSNR*, *SSIM*: likeness of pictures in a window around the body, more is better",
+}
 
 
 def results_table(figures: Mapping[str, float]) -> str:
@@ -72,6 +72,8 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
         return ""
     parts = [f"`train` is the recording {recording}"]
     others = {
+        "frames": "`frames` its last frames, held out",
+        "camera": "`camera` its held-out cameras",
         "train/": "`train/...` the others that were learned from",
         "test/": "`test/...` those held out, `test` their mean",
     }
@@ -79,7 +81,12 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
     prefixes = dict(MODELS)
     rows = [f"*{name}*: {about}" for name, about in ROWS.items()
             if any(f"{prefixes[name]}{column}/{metric}" in figures for column in columns for metric in UNITS)]  # fmt: skip
-    return f"Rows: {'; '.join(rows)}. Columns: {', '.join(parts)}. Figures: {FIGURES}."
+    said = [
+        about
+        for metric, about in FIGURES.items()
+        if any(key.endswith(f"/{metric}") for key in figures)
+    ]
+    return f"Rows: {'; '.join(rows)}. Columns: {', '.join(parts)}. Figures: {'; '.join(said)}."
 
 
 def _sequences(figures: Mapping[str, float]) -> list[str]:
@@ -89,7 +96,7 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
 
 
 def parameter_table(figures: Mapping[str, float], law: str, fixed: Collection[str] = ()) -> str:
-    """Markdown table of identified parameters: of the prior and of the learned law, each with its relative error where the
+    """Markdown table of identified parameters: of the prior and of the learned law, with columns of their relative errors where a
     truth is known. law: of the prior, which says what they are measured in; fixed: those that were not learned, no rows."""
     found = (k.split("/", 1)[1] for k in figures if k.startswith("id_prior/") and k.count("/") == 1)
     names = [n for n in found if n not in fixed and not n.endswith(("_relative_error", "_ratio"))]
@@ -98,7 +105,8 @@ def parameter_table(figures: Mapping[str, float], law: str, fixed: Collection[st
              *(f"{figures[key]:.1%}" if (key := f"{stage}/{n}_relative_error") in figures else "" for stage in stages)]
             for n in names]  # fmt: skip
     header = ["parameter", "prior", "adapted", "error of prior", "error of adapted"]
-    return markdown(header, rows) if rows else ""
+    shown = len(header) if any(any(row[3:]) for row in rows) else 3
+    return markdown(header[:shown], [row[:shown] for row in rows]) if rows else ""
 
 
 def with_unit(law: str, name: str) -> str:

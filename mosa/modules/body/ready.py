@@ -57,7 +57,7 @@ class Ready:
             )  # fmt: skip
         else:
             if self.timing:
-                raise ConfigError("simulation.adaptive: expected false with criterion=corrected")
+                raise ConfigError("simulation.adaptive: expected criterion=free beside it")
             seen = (observed[:frames, None] if stacked else observed[:frames]) + lift.detach()
             hidden = (
                 None if unseen is None else lambda x, frame: unseen(x - lift.detach().to(x), frame)

@@ -11,7 +11,8 @@ from mosa.settings import Positive, Settings, Text, Weight
 
 
 class Criterion(Settings):
-    """What a fit compares with the motion that was seen. Calibration always compares free rollouts."""
+    """What a fit compares with the motion that was seen. Calibration compares free rollouts by Adam, of laws that yield or flow,
+    and with adaptive substeps."""
 
     where: ClassVar[str] = "criterion"
     needs: ClassVar[dict[str, str]] = {"gain": "name!=free"}

@@ -56,7 +56,7 @@ class Stage(StageSettings):
 
     @property
     def calibrates(self) -> bool:
-        """Whether the stage learns the global parameters alone, from free rollouts of which more and more frames count."""
+        """Whether the stage learns the global parameters alone."""
         return self.name == "prior"
 
     @property

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider, Particles, Shape, collider_of
-from mosa.physics.contact.keys import rows, three, told
+from mosa.physics.contact.keys import MotionKeys, rows, three, told
 from mosa.physics.contact.motion import Motion, Points, Trajectory, ends, pose_at
 from mosa.physics.contact.reference import signed_distance
 from mosa.settings import Expected, Section, Text, Weight, Whole, check_values
@@ -193,6 +193,11 @@ def _driven(item: Mapping, where: str, number: int) -> Driven:
     more = {key: item.pop(key) for key in ("mass", "held") if key in item}
     own = {key: item.pop(key) for key in ("indices", "points") if key in item}
     moved, given = None, set(item.get("motion") or {})
+    known = (*MotionKeys.model_fields, "path", "points")
+    if wrong := sorted(given.difference(known)):
+        raise ConfigError(
+            f"{where}.motion.{wrong[0]}: unknown key; expected one of {', '.join(known)}"
+        )
     if given & {"path", "points"}:
         if given not in ({"path"}, {"times", "points"}):
             raise ConfigError(f"{where}.motion: expected path alone, or times and points")

@@ -170,6 +170,7 @@ def test_points_of_a_file_lead_what_is_nearest(tmp_path):
     ({"type": "sphere"}, "a sphere needs radius"),
     ({"motion": {"times": [0.0, 1.0], "points": [[[1, 2, 3]], [[1, 2]]]}}, r"driven\[0\].motion: expected lists times"),
     ({"motion": {"times": [0.0, float("inf")], "points": [[[1, 2, 3]]] * 2}}, r"motion: times: .* ascending finite numbers"),
+    ({"motion": {"file": "a.npz"}}, r"driven\[0\].motion.file: unknown key; expected one of velocity, .*, path, points"),
     ({"motion": {"points": [[[1, 2, 3]]]}}, r"driven\[0\].motion: expected path alone, or times and points"),
     ({"indices": [1], "held": False}, r"driven\[0\]: expected a mass and no motion with held: false"),
     ({"indices": [1], "held": False, "mass": 1.0, "motion": {}}, "found .*'motion'"),
