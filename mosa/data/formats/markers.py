@@ -34,7 +34,7 @@ WIDE = 3.0  # the world reaches so many sizes of the body beyond it
 
 
 def load_markers(
-    *, path: Path, body: Mapping[str, Any], density: float, ground: Ground | None = None,
+    *, path: Path, body: Mapping[str, Any] | None = None, density: float, ground: Ground | None = None,
     name: str | None = None, sequence: str = "train",
     points: Mapping[str, Sequence[float]] | None = None, tracked: Sequence[str] | None = None,
     start: float | str = AUTO, duration: float | None = None, fps: float | None = None,
@@ -139,7 +139,7 @@ def medians(places: np.ndarray) -> np.ndarray:
     return found
 
 
-def solid_of(body: Mapping[str, Any], folder: Path):
+def solid_of(body: Mapping[str, Any] | None, folder: Path):
     """The body at rest as a solid with a pose. folder: of relative paths. Errors: ConfigError."""
     moves = isinstance(body, Mapping) and body.get("motion")
     if moves or not isinstance(body, Mapping) or body.get("type") not in ("box", "mesh"):

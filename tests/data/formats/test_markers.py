@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
+from omegaconf import OmegaConf
 from small_bodies import FREE, NU, E, small_body
 
+from mosa import compose
 from mosa.data.io.markers import Recording, alignment, read_markers, released, swung
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
@@ -165,9 +168,18 @@ def test_points_in_line_align_nothing():
         alignment(line, dict(zip("abc", line.tolist())), "scene.points")
 
 
+@pytest.mark.parametrize("body", [
+    "{type: mesh, path: a.obj, scale: 0.001, rotation: [0,1,0,20]}", "{type: box, size: [1,2,3], rotation: [0,1,0,20]}",
+])  # fmt: skip
+def test_a_body_has_exactly_the_keys_that_were_given(body):
+    section = compose("scene=markers", f"scene.body={body}").scene.body
+    assert OmegaConf.to_container(section) == yaml.safe_load(body)
+
+
 @pytest.mark.parametrize(
     "keys, said",
-    [({"tracked": ["e"]}, "scene.tracked"), ({"start": 9.0}, "scene.start"), ({"body": {"type": "ball"}}, "scene.body"),
+    [({"body": None}, "scene.body: expected .type: box"),
+     ({"tracked": ["e"]}, "scene.tracked"), ({"start": 9.0}, "scene.start"), ({"body": {"type": "ball"}}, "scene.body"),
      ({"body": BOX | {"motion": {"velocity": [1, 0, 0]}}}, "scene.body"),
      ({"body": BOX | {"size": [400, 100, 200]}}, "scene.body: .*another unit"),
      ({"holdout_frames": 99}, "scene.holdout_frames"), ({"loads": [BOX]}, "scene.loads"),
