@@ -126,6 +126,14 @@ def test_a_gravity_that_the_object_does_not_follow_is_refused(scene):
         )
 
 
+@pytest.mark.parametrize("tick", [1.0, 1 / FPS * 1e3])
+def test_a_clock_of_frames_or_milliseconds_is_refused_where_two_frames_fall(scene, tick):
+    short = reordered(scene, list(range(7, FRAMES)))
+    check_fall(replace(short, times=scene.times[: FRAMES - 7]), "scene")
+    with pytest.raises(DataError, match=r"expected times in seconds; check scene\.fps"):
+        check_fall(replace(short, times=tick * torch.arange(FRAMES - 7).float()), "scene")
+
+
 def test_a_gravity_is_told_by_the_flight_after_a_bounce_where_none_is_before(monkeypatch):
     monkeypatch.setitem(globals(), "FRAMES", 20)
     whole = ball()
