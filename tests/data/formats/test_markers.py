@@ -24,7 +24,8 @@ from mosa.modules.fitting.stages import Stage
 from mosa.modules.fitting.training_sequences import Take
 from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.world import Start
-from mosa.reconstruction.marker_body import cues_of_markers, filled, marker_spacing
+from mosa.reconstruction.marker_body import cues_of_markers, filled, in_own_axes, marker_spacing
+from mosa.reconstruction.resolution import resolution
 from mosa.types import MarkerCues, Markers
 
 BEAMS = Path(os.environ.get("MOSA_DATA", "")) / "real" / "beams"
@@ -240,6 +241,16 @@ def swinging(tmp_path_factory):
     seen = cues.seen(x)
     seen[5, 1] = torch.nan
     return body, world, begin, replace(cues, positions=seen)
+
+
+def test_a_turned_body_is_as_thick_as_it_is_upright(tmp_path):
+    path, found = write(tmp_path / "fall.csv", let_go()[0], "abcd", let_go()[1]), []
+    for turn in ([0, 1, 0, 0], [0.3, 0.2, 1, 25]):
+        body = BOX | {"rotation": turn}
+        scene = load_scene(format="markers", path=str(path), body=body, density=900.0)
+        x, _ = filled(scene.markers.body, spacing := marker_spacing(scene, 700))
+        found.append(resolution(in_own_axes(scene, x), spacing, 1.6 * spacing))
+    assert found[0] == found[1] and found[0].cells > 2 and found[0].pieces == 1
 
 
 def test_points_go_with_every_affine_motion(swinging):
