@@ -243,6 +243,13 @@ def swinging(tmp_path_factory):
     return body, world, begin, replace(cues, positions=seen)
 
 
+def test_how_far_points_are_from_the_surface_is_said(tmp_path, caplog):
+    path = write(tmp_path / "fall.csv", let_go()[0], "abcd", let_go()[1])
+    caplog.set_level("INFO")
+    load_scene(format="markers", path=str(path), body=BOX | {"position": [0, 0.02, 0]}, density=1e3)
+    assert "at rest the points are -20.0 to 0.0 mm from the body's surface" in caplog.text
+
+
 def test_a_turned_body_is_as_thick_as_it_is_upright(tmp_path):
     path, found = write(tmp_path / "fall.csv", let_go()[0], "abcd", let_go()[1]), []
     for turn in ([0, 1, 0, 0], [0.3, 0.2, 1, 25]):
