@@ -88,13 +88,18 @@ def way_out(key: str) -> str:
     if key in ("run_dir", "out_dir", "output_dir"):
         return "; expected hydra.run.dir=<folder>"
     group, _, name = key.partition(".")
-    having = [option for option, keys in options_of(group).items() if key in keys] if name else []
+    options = options_of(group) if name else {}
+    having = [option for option, keys in options.items() if key in keys]
     if having:
         having = [each for each in having if not any(each.startswith(f"{o}_") for o in having)]
         have = f"{', '.join(having)} {'have' if having[1:] else 'has'}"
         own = "; a built-in scene always brings its own held-out drops"
         rest = own if key == "scene.test" else ""
         return f"; {group}={have} it, the chosen {group} has not{rest}"
+    section, _, last = key.rpartition(".")
+    files = {each.rpartition(".")[::2] for keys in options.values() for each in keys}
+    if near := nearest(last, [each for where, each in sorted(files) if where == section], section):
+        return near
     known = [each for model in COMMANDS.values() for each in keys_of(node_of(model))]
     known = sorted({each for each in known if each != key})  # which another command may have
     if deeper := [each for each in known if each.endswith(f".{key}")]:
@@ -137,7 +142,11 @@ def said_of(error: BaseException, given: Sequence[str] = ()) -> str:
             way = f"{key}=none" if "none" in options else f"without {key}= it has its default"
             said = f"{key}: expected one of {', '.join(options)}, found null; {way}"
     if found := re.search(r"\.\nTo append to your config use \+([\w.]+)=.*", said):
-        said = said.replace(found[0], f"{way_out(found[1])}.")
+        key = found[1]
+        if inner := re.search(r"\nKey '([^']+)' is not in struct", said):  # in a whole section
+            whole = key if inner[1] in key.split(".") else f"{key}.{inner[1]}"
+            said, key = said.replace(inner[0], "").replace(f"'{key}'", f"'{whole}'"), whole
+        said = said.replace(found[0], f"{way_out(key)}.")
     return said[:2000]
 
 

@@ -377,6 +377,8 @@ def identification(body: Body, scene: Scene, world: World) -> dict[str, float]:
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
         height = model.contact.height(world.ground, body.settings.dx)
         figures[f"{prefix}/contact_offset_m"] = float(height.detach())
+    if body.contact.at_limit(world.ground, body.settings.dx):
+        figures["id/contact_at_limit"] = 1.0
     return figures
 
 

@@ -42,6 +42,11 @@ def filled(solid, spacing: float) -> tuple[Tensor, Tensor]:
     return (local @ rotation.T + position).float(), volume
 
 
+def in_own_axes(scene: Scene, places: Tensor) -> Tensor:
+    """Places (N, 3) at rest in the axes of the given shape, along which `filled` lays its lattice; the origin is as it was."""
+    return places @ pose_of(points_of(scene).body)[1].to(places)
+
+
 def points_of(scene: Scene) -> Markers:
     """Of a scene that has tracked points."""
     assert scene.markers is not None

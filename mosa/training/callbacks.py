@@ -168,14 +168,16 @@ class Pace(L.Callback):
 
 
 class ImageStrips(L.Callback):
-    """Adds a strip of real (above) and rendered (below) frames to the loggers every `every` iterations."""
+    """Adds a strip of real (above) and rendered (below) frames to the loggers every `every` iterations, where
+    there are images."""
 
     def __init__(self, every: int) -> None:
         self.every = every
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         shown = [each for each in module.loggers if isinstance(each, PICTURED)]
-        if shown and self.every > 0 and module.steps_done % self.every == 0:
+        due = self.every > 0 and module.steps_done % self.every == 0
+        if shown and due and len(module.takes[0].observations.cameras):
             picture = enlarged(strip(module))
             add_picture(shown, "real_above_rendered_below", picture, module.steps_done)
 

@@ -29,6 +29,7 @@ from mosa.modules.fitting.parameters import warn_of_ends
 from mosa.physics import exact_sums
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.driven import driven_from_config
+from mosa.reconstruction.marker_body import in_own_axes
 from mosa.reconstruction.pose.starts import appearance_of, sequence_start
 from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.system.limits import named_device, return_memory
@@ -120,7 +121,8 @@ def train(cfg: DictConfig) -> float | None:
         shape, dx = data.shape, data.dx
     cm3 = 1e6 * float(shape.volume.sum())
     log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(shape.rest), cm3, dx)
-    resolved = resolution(shape.rest, data.reconstruction.spacing, dx)
+    lattice = shape.rest if filmed else in_own_axes(scene, shape.rest)
+    resolved = resolution(lattice, data.reconstruction.spacing, dx)
     thin = "" if resolved.enough else (
         f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
         f"{ENOUGH:g}: the grid makes them too stiff and the learned law compensates for it, so it may predict worse "

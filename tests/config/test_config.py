@@ -74,10 +74,13 @@ def test_a_mistyped_option_is_refused(override):
     ("fps=24", r"'fps'; expected .*film\.fps"),
     ("run_dir=a", r"'run_dir'; expected hydra\.run\.dir=<folder>"),
     ("simulation.particels=200", "'simulation.particels'; the nearest is simulation.particles"),
+    (("scene=transforms", "scene.ground={hight: 0.1}"), r"'scene\.ground\.hight'; the nearest is scene\.ground\.height\."),
+    (("scene=transforms", "scene.ground.hight=0.1"), r"'scene\.ground\.hight'; the nearest is scene\.ground\.height\."),
+    (("scene=transforms", "scene.body={path: a.ply}"), r"override 'scene\.body\.path'\.$"),
 ])  # fmt: skip
 def test_a_mistyped_override_in_python_names_what_there_is(override, message):
     with pytest.raises(ConfigError, match=message) as found:
-        mosa.compose(override)
+        mosa.compose(*([override] if isinstance(override, str) else override))
     assert "use +" not in str(found.value)
 
 

@@ -10,6 +10,7 @@ from small_bodies import DX, STICKY, small_body
 from mosa.errors import SimulationDiverged
 from mosa.evaluation import evaluate as evaluation
 from mosa.evaluation import floor, metrics
+from mosa.evaluation.analysis.tables import determined_text
 from mosa.evaluation.evaluate import (
     Sequence,
     evaluate,
@@ -120,3 +121,17 @@ def test_the_contact_offset_is_that_of_the_ground_which_was_found(mode, cells):
     found = evaluation.identification(body, scene, world)
     assert found["id/contact_offset_m"] == pytest.approx(cells * DX, abs=1e-9)
     assert found["id_prior/contact_offset_m"] == found["id/contact_offset_m"]
+
+
+@pytest.mark.parametrize("cells, accuracy, said", [
+    (1.0, None, True), (0.3, None, False), (0.9, None, False), (-0.5, None, True), (0.55, None, True),
+    (0.6, 0.0, True), (0.5, 0.0, False),
+])  # fmt: skip
+def test_a_contact_height_at_its_limit_is_said(cells, accuracy, said):
+    body = small_body(contact=True)
+    body.contact.cells.data.fill_(cells)
+    world = replace(STICKY, ground=Ground(0.0, "sticky", accuracy=accuracy))
+    found = evaluation.identification(body, SimpleNamespace(known_parameters={}), world)
+    assert ("id/contact_at_limit" in found) == said
+    text = determined_text(found | {"posterior/draws": 12}, "neo_hookean")
+    assert ("The contact height ended **at the limit**" in text) == said

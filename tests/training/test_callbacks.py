@@ -12,13 +12,14 @@ import torch
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import EarlyStopping, Timer
 from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
+from lightning.pytorch.loggers import TensorBoardLogger
 
 from mosa import compose
 from mosa.config.checkpoints import check_plain
 from mosa.errors import ConfigError
 from mosa.modules.fitting.stages import Stage
 from mosa.modules.fitting.stages_callback import Stages
-from mosa.training.callbacks import KeepLast, Pace, StageNotes
+from mosa.training.callbacks import ImageStrips, KeepLast, Pace, StageNotes
 from mosa.training.fitting import build_trainer
 from mosa.training.run_folder import quiet
 
@@ -71,6 +72,13 @@ def test_a_step_of_gauss_newton_has_no_rate():
     assert [set(values) for values in fit.logged] == [{"time/step_s"}] * 2 + [
         {"time/step_s", "lr/material"}
     ]
+
+
+def test_tracked_points_have_no_strip(tmp_path):
+    logger = TensorBoardLogger(str(tmp_path))
+    take = SimpleNamespace(observations=SimpleNamespace(cameras=()))
+    module = SimpleNamespace(loggers=[logger], steps_done=10, takes=[take])
+    ImageStrips(10).on_train_batch_end(SimpleNamespace(), module)  # says nothing, simulates nothing
 
 
 def test_stages_are_noted_when_they_begin_and_end(caplog):

@@ -221,7 +221,17 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
 def check_flight(
     track: Track, aloft: Tensor, label: str, g: float, down: Tensor, keys: str
 ) -> None:
-    """Where too few frames are before contact: of the longest flight after it, which something unseen may touch, a warning."""
+    """Where too few frames are before contact: of the longest flight after it, which something unseen may touch, a warning.
+
+    An object that is aloft in a frame and in the next rises and falls between them by g dt^2/8. Errors: DataError where this is
+    more than all heights that the film shows, as where its clock counts milliseconds or frames."""
+    heights, rise = track.points @ -down, g * track.dt**2 / 8
+    shown = float(heights.max() - heights.min()) + 2 * track.radius
+    if bool((aloft[1:] & aloft[:-1]).any()) and rise > shown:
+        raise DataError(
+            f"{label}: the object is aloft in frames that are {track.dt:.3g} s apart, between which it would rise and fall by "
+            f"{rise:.3g} m; the heights that the film shows differ by {shown:.3g} m: expected times in seconds; check {keys}"
+        )
     runs = (list(run) for _, run in groupby(range(len(aloft)), aloft.tolist().__getitem__))
     flight = max((run for run in runs if aloft[run[0]]), key=len, default=[])
     if (frames := len(flight)) > 3:

@@ -100,12 +100,15 @@ def whole_views(scene: Scene, frame: int) -> list[int]:
 def check_outlines(scene: Scene, label: str) -> None:
     """The mattes of a frame are those of one solid, and it meets the ground where the ground is said to be.
 
-    Looks at frame 0 and at the one where the object is lowest. Errors: DataError naming cameras and frame, or scene.ground.height
-    and scene.up. Silent where fewer than three mattes are whole."""
+    Looks at frame 0, at the one where the object is lowest, and, if that is the last, at the lowest in which it turns round.
+    Errors: DataError naming cameras and frame, or scene.ground.height and scene.up. Silent where fewer than three mattes are
+    whole."""
     track = track_of(scene)
-    turn = 0 if track is None else int((track.points @ scene.up.double()).argmin())
+    low = turn = 0 if track is None else int((track.points @ scene.up.double()).argmin())
+    if track is not None and low == scene.frames - 1:
+        turn = lowest_turn(track.points @ scene.up.double(), track.noise)
     worst = (0.0, "")
-    for frame in sorted({0, turn}):
+    for frame in sorted({0, low, turn}):
         views = whole_views(scene, frame)
         if len(views) < 3:
             continue
@@ -135,7 +138,7 @@ def check_outlines(scene: Scene, label: str) -> None:
                 f"found {below:.0%} of it below, its lowest point at {float(heights.min()) + scene.ground.height:.3g} m; correct "
                 f"it, or scene.up (now {[round(float(x), 3) for x in scene.up]}), or the axes of the poses"
             )
-        if 0 < frame < scene.frames - 1:
+        if track is not None and 0 < frame == turn:
             most = lowest_at_most(points, heights, pitch, cameras)
             step = float((track.points @ scene.up.double()).diff().abs().max())
             check_landing(float(heights.min()), most, step, track.radius, frame, label)
@@ -143,6 +146,18 @@ def check_outlines(scene: Scene, label: str) -> None:
         raise DataError(worst[1])
     if worst[0] > SUSPECT:
         warnings.warn(worst[1], stacklevel=3)
+
+
+def lowest_turn(heights: Tensor, noise: float) -> int:
+    """The lowest frame before and after which the object's middle is higher, by more than its noise [m]; 0 where there is none.
+    heights: (T,) [m]. A film may end in a fall that is deeper than the place where it turned round."""
+    turns = [
+        t
+        for t in range(1, len(heights) - 1)
+        if heights[t] == heights[t - 1 : t + 2].min()
+        and min(heights[:t].max(), heights[t + 1 :].max()) > heights[t] + 3 * noise
+    ]
+    return min(turns, key=lambda t: float(heights[t]), default=0)
 
 
 def worst_uncovered(

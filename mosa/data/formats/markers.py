@@ -18,6 +18,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Box, collider_of
 from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.contact.mesh import SignedDistanceField
+from mosa.physics.contact.reference import signed_distance
 from mosa.settings import Expected, Names, Positive, Three, Whole, check_values, is_number
 from mosa.types import AUTO, Cameras, Ground, Markers, Scene
 
@@ -34,7 +35,7 @@ WIDE = 3.0  # the world reaches so many sizes of the body beyond it
 
 
 def load_markers(
-    *, path: Path, body: Mapping[str, Any], density: float, ground: Ground | None = None,
+    *, path: Path, body: Mapping[str, Any] | None = None, density: float, ground: Ground | None = None,
     name: str | None = None, sequence: str = "train",
     points: Mapping[str, Sequence[float]] | None = None, tracked: Sequence[str] | None = None,
     start: float | str = AUTO, duration: float | None = None, fps: float | None = None,
@@ -100,6 +101,15 @@ def load_markers(
         )
     log.info("%s: let go at %.4f s; %d frames at %g Hz", Path(path).name, begin, frames, rate)
     solid = solid_of(body, Path(path).parent)
+    at_rest, tracks = (torch.from_numpy(each).float() for each in (rest, moving))
+    position, turn = pose_of(solid)
+    apart = 1e3 * signed_distance(solid.shape, (at_rest.double() - position) @ turn).sort().values
+    log.info(
+        "%s: at rest the points are %.1f to %.1f mm from the body's surface (negative: inside)",
+        Path(path).name,
+        apart[0],
+        apart[-1],
+    )
     low, high = corners(solid)
     far = WIDE * (across := float((high - low).max()))
     span = float(np.ptp(rest, axis=0).max())
@@ -115,7 +125,6 @@ def load_markers(
                 "what holds it belongs to world.driven"
             )
     nothing = torch.zeros(0, frames, 1, 1)
-    at_rest, tracks = (torch.from_numpy(each).float() for each in (rest, moving))
     return Scene(
         name=name or Path(path).stem, sequence=sequence, mattes=nothing,
         images=nothing[..., None].expand(-1, -1, -1, -1, 3),
@@ -139,7 +148,7 @@ def medians(places: np.ndarray) -> np.ndarray:
     return found
 
 
-def solid_of(body: Mapping[str, Any], folder: Path):
+def solid_of(body: Mapping[str, Any] | None, folder: Path):
     """The body at rest as a solid with a pose. folder: of relative paths. Errors: ConfigError."""
     moves = isinstance(body, Mapping) and body.get("motion")
     if moves or not isinstance(body, Mapping) or body.get("type") not in ("box", "mesh"):

@@ -253,6 +253,13 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
                 f"- The force on {of} is **not met**: off by {off:.0%} of the largest measured, allowed are {allowed:.1%}. "
                 "Do not use these numbers: check its sign, axes, times and unit (N)."
             )
+    if figures.get("id/contact_at_limit"):
+        height = 1e3 * figures["id/contact_offset_m"]
+        lines.append(
+            f"- The contact height ended **at the limit** of what a fit may take ({height:.1f} mm from the stated ground), and "
+            "the moduli compensate for the rest: their true error may be larger than stated. Check scene.ground.height and "
+            "accuracy, and how the ground is touched (scene.ground.mode=auto finds it)."
+        )
     says = "with a standard deviation of"
     for name in RELATIVE:
         if (sd := figures.get(f"posterior/{name}_relative_sd")) is not None:

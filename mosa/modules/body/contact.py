@@ -13,6 +13,8 @@ from mosa.types import Ground
 
 ROUNDED = 1e-3
 """Cells: a ground so near below a layer of nodes is at it."""
+ON_BOUND = 1e-3
+"""Cells from a bound within which a fit has ended on it."""
 
 
 class ContactOffset(nn.Module):
@@ -72,6 +74,12 @@ class ContactOffset(nn.Module):
             low, high = self.LIMITS
             return sd, (max(low, self.START - 2 * sd), min(high, self.START + 2 * sd))
         return (self.NARROW, self.WITHIN) if free else (self.UNKNOWN, self.LIMITS)
+
+    def at_limit(self, ground: Ground | None, dx: float) -> bool:
+        """Whether a fit ended on a bound: the true contact is beyond it, or other errors look like one that is."""
+        bounds = {each for free in (True, False) for each in self.prior(ground, dx, free)[1]}
+        known = ground is not None and self.enabled
+        return known and any(abs(float(self.cells.detach()) - each) < ON_BOUND for each in bounds)
 
     @torch.no_grad()
     def project(self) -> None:

@@ -126,6 +126,24 @@ def test_a_gravity_that_the_object_does_not_follow_is_refused(scene):
         )
 
 
+@pytest.mark.parametrize("tick", [1.0, 1 / FPS * 1e3])
+def test_a_clock_of_frames_or_milliseconds_is_refused_where_two_frames_fall(scene, tick):
+    short = reordered(scene, list(range(7, FRAMES)))
+    check_fall(replace(short, times=scene.times[: FRAMES - 7]), "scene")
+    with pytest.raises(DataError, match=r"expected times in seconds; check scene\.fps"):
+        check_fall(replace(short, times=tick * torch.arange(FRAMES - 7).float()), "scene")
+
+
+def test_where_it_turns_round_is_seen_before_a_deeper_end_of_the_film(monkeypatch):
+    monkeypatch.setitem(globals(), "FRAMES", 21)  # its last frame is lower than the first contact
+    bouncing = ball()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_outlines(bouncing, "scene")
+    with pytest.warns(UserWarning, match="turns round in frame 9 .* below the ground"):
+        check_outlines(replace(bouncing, ground=Ground(0.1)), "scene")
+
+
 def test_a_gravity_is_told_by_the_flight_after_a_bounce_where_none_is_before(monkeypatch):
     monkeypatch.setitem(globals(), "FRAMES", 20)
     whole = ball()

@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
+from omegaconf import OmegaConf
 from small_bodies import FREE, NU, E, small_body
 
+from mosa import compose
 from mosa.data.io.markers import Recording, alignment, read_markers, released, swung
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
@@ -21,7 +24,8 @@ from mosa.modules.fitting.stages import Stage
 from mosa.modules.fitting.training_sequences import Take
 from mosa.physics.contact.driven import driven_from_config
 from mosa.physics.world import Start
-from mosa.reconstruction.marker_body import cues_of_markers, filled, marker_spacing
+from mosa.reconstruction.marker_body import cues_of_markers, filled, in_own_axes, marker_spacing
+from mosa.reconstruction.resolution import resolution
 from mosa.types import MarkerCues, Markers
 
 BEAMS = Path(os.environ.get("MOSA_DATA", "")) / "real" / "beams"
@@ -165,9 +169,18 @@ def test_points_in_line_align_nothing():
         alignment(line, dict(zip("abc", line.tolist())), "scene.points")
 
 
+@pytest.mark.parametrize("body", [
+    "{type: mesh, path: a.obj, scale: 0.001, rotation: [0,1,0,20]}", "{type: box, size: [1,2,3], rotation: [0,1,0,20]}",
+])  # fmt: skip
+def test_a_body_has_exactly_the_keys_that_were_given(body):
+    section = compose("scene=markers", f"scene.body={body}").scene.body
+    assert OmegaConf.to_container(section) == yaml.safe_load(body)
+
+
 @pytest.mark.parametrize(
     "keys, said",
-    [({"tracked": ["e"]}, "scene.tracked"), ({"start": 9.0}, "scene.start"), ({"body": {"type": "ball"}}, "scene.body"),
+    [({"body": None}, "scene.body: expected .type: box"),
+     ({"tracked": ["e"]}, "scene.tracked"), ({"start": 9.0}, "scene.start"), ({"body": {"type": "ball"}}, "scene.body"),
      ({"body": BOX | {"motion": {"velocity": [1, 0, 0]}}}, "scene.body"),
      ({"body": BOX | {"size": [400, 100, 200]}}, "scene.body: .*another unit"),
      ({"holdout_frames": 99}, "scene.holdout_frames"), ({"loads": [BOX]}, "scene.loads"),
@@ -228,6 +241,23 @@ def swinging(tmp_path_factory):
     seen = cues.seen(x)
     seen[5, 1] = torch.nan
     return body, world, begin, replace(cues, positions=seen)
+
+
+def test_how_far_points_are_from_the_surface_is_said(tmp_path, caplog):
+    path = write(tmp_path / "fall.csv", let_go()[0], "abcd", let_go()[1])
+    caplog.set_level("INFO")
+    load_scene(format="markers", path=str(path), body=BOX | {"position": [0, 0.02, 0]}, density=1e3)
+    assert "at rest the points are -20.0 to 0.0 mm from the body's surface" in caplog.text
+
+
+def test_a_turned_body_is_as_thick_as_it_is_upright(tmp_path):
+    path, found = write(tmp_path / "fall.csv", let_go()[0], "abcd", let_go()[1]), []
+    for turn in ([0, 1, 0, 0], [0.3, 0.2, 1, 25]):
+        body = BOX | {"rotation": turn}
+        scene = load_scene(format="markers", path=str(path), body=body, density=900.0)
+        x, _ = filled(scene.markers.body, spacing := marker_spacing(scene, 700))
+        found.append(resolution(in_own_axes(scene, x), spacing, 1.6 * spacing))
+    assert found[0] == found[1] and found[0].cells > 2 and found[0].pieces == 1
 
 
 def test_points_go_with_every_affine_motion(swinging):
