@@ -180,6 +180,11 @@ def test_a_law_is_exported_as_nearly_incompressible():
         source(Material("neo_hookean", law), HyperelasticAdapter(), 0.499)
 
 
+def test_a_wrong_checkpoint_is_named_by_the_command_s_argument(tmp_path):
+    with pytest.raises(DataError, match=r"^source: .*gone\.ckpt: no such file"):
+        read_source(tmp_path / "gone.ckpt")
+
+
 def test_an_energy_of_another_package_is_exported(tmp_path, monkeypatch, capsys):
     form = "from mosa.export.energies import ENERGIES, neo_hookean\nENERGIES['stvk_paper'] = neo_hookean"
     (tmp_path / "own_energy.py").write_text(form)
