@@ -106,6 +106,8 @@ def source(material: Material, adapter: object, nu: float | None = None) -> Sour
         raise ConfigError(f"export: expected a run with adapter=operator or none, {other}")
     material = in_double(material, configured=False)
     if nu is not None:
+        if adapter is not None and not adapter.numbers.any():
+            adapter = None  # kept isotropic: it adds nothing at any nu
         set_poisson(material, adapter, nu)
     adapter = None if adapter is None else adapter.double()
     values: dict[str, float] = {}
