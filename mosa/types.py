@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
+from mosa.errors import ConfigError
+
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
@@ -353,7 +355,13 @@ class ParticleState:
 
     @classmethod
     def at_rest(cls, x: Tensor) -> ParticleState:
-        """Undeformed particles at x (N, 3) or (B, N, 3) [m] that do not move."""
+        """Undeformed particles at x (N, 3) or (B, N, 3) [m] that do not move. Errors: ConfigError for anything else."""
+        if not (isinstance(x, Tensor) and x.ndim in (2, 3) and x.shape[-1] == 3 and x.is_floating_point()):  # fmt: skip
+            found = f"{x.dtype} {tuple(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
+            raise ConfigError(
+                "x: expected a torch tensor of floating point numbers of shape (particles, 3) or (worlds, particles, 3), "
+                f"found {found}"
+            )
         still = torch.zeros_like(x)
         F = torch.eye(3).to(x).expand(*x.shape, 3).contiguous()
         return cls(x, still, torch.zeros_like(F), F, F)

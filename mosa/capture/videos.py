@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from warnings import warn
 
 import cv2
 import numpy as np
@@ -13,6 +14,8 @@ from mosa.capture.poses import VIDEOS
 from mosa.data.images.reading import read_image
 from mosa.errors import ConfigError, DataError
 from mosa.system.ply import named
+
+PICTURES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
@@ -102,21 +105,30 @@ def frames_of(
 
 def plate_of(folder: Path | None, clip: Clip, seconds: tuple[float, float] | None) -> np.ndarray:
     """Empty background (H, W, 3) in [0, 1]: a picture or the median of a video in `folder` named as the phone, or else the median
-    of the clip's own frames in `seconds` of its clock. Errors: DataError naming what is expected where."""
+    of the clip's own frames in `seconds` of its clock, which a file in the folder replaces with a warning. Errors: DataError naming
+    what is expected where."""
     stem = clip.path.stem
     if folder is not None and folder.is_dir():
         for file in sorted(folder.iterdir()):
-            if file.stem == stem and file.suffix.lower() in VIDEOS:
+            kind = file.suffix.lower()
+            if file.stem != stem or kind not in (*VIDEOS, *PICTURES):
+                continue
+            if seconds is not None:
+                warn(
+                    f"plate_seconds: has no effect on {clip.path.name}, whose background plate is {file}: "
+                    "move that file away to use the seconds",
+                    stacklevel=1,
+                )
+            if kind in VIDEOS:
                 other = open_clip(file)
                 return median_of(other, 0, len(other.times) - 1, clip)
-            if file.stem == stem and file.suffix.lower() in (".png", ".jpg", ".jpeg"):
-                # refused where it is damaged, or larger than pictures are; OpenCV would ask for memory first
-                read_image(file)
-                picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
-                if picture is None:
-                    raise DataError(f"{file}: expected a readable picture, found a damaged one")
-                picture = fitting(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), clip, file)
-                return picture.astype(np.float32) / 255
+            # refused where it is damaged, or larger than pictures are; OpenCV would ask for memory first
+            read_image(file)
+            picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
+            if picture is None:
+                raise DataError(f"{file}: expected a readable picture, found a damaged one")
+            picture = fitting(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), clip, file)
+            return picture.astype(np.float32) / 255
     if seconds is None:
         raise DataError(
             f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) in "

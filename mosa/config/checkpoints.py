@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib
 import pickletools
+import re
 import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
@@ -51,6 +52,15 @@ def reading(path: str | Path) -> Iterator[None]:
         yield
     except MosaError as error:
         raise DataError(f"ckpt_path: {path}: {error}") from error
+
+
+@contextmanager
+def given_as(argument: str) -> Iterator[None]:
+    """Errors that name a checkpoint's file by the key `ckpt_path` name it by this argument, which a command has in its place."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(re.sub(r"^ckpt_path\b", argument, str(error))) from error
 
 
 def read_checkpoint(path: str | Path) -> dict:

@@ -14,7 +14,7 @@ from warnings import warn
 import torch
 from torch import Tensor
 
-from mosa.config.checkpoints import read_checkpoint, reading, record_of
+from mosa.config.checkpoints import given_as, read_checkpoint, reading, record_of
 from mosa.config.record import PosteriorRecord
 from mosa.data.formats.footage import read_json
 from mosa.errors import ConfigError, DataError
@@ -54,13 +54,11 @@ def known_numbers(path: str, material: Material, adapter: Any, where: str) -> Po
             ) from error
         inflation, alike = 1.0, adapter is not None and adapter.energetic
     else:
-        try:
+        with given_as(where):
             run = record_of(read_checkpoint(path), path)
             law, given = run.law or run.sections.prior.law, run.sections.prior.parameters
             with reading(path):
                 begun = Material(law, {name: given[name] for name in taken(law, given)})
-        except DataError as error:
-            raise DataError(f"{where}{str(error).removeprefix('ckpt_path')}") from error
         record = run.posterior
         # numbers of another kind of operator have the same names
         build = adapter_class(run.sections.adapter.plain())

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from mosa.config.checkpoints import given_as
 from mosa.environments.task import LAST, Task, Trials, View
 from mosa.environments.truth import true_twin
 from mosa.errors import ConfigError, DataError, SimulationDiverged
@@ -50,7 +51,8 @@ def simulator_named(
         more = ", or truth.scene=<a built-in scene>" * (name == "truth")
         wanted = f"a run's checkpoint{more} for simulator={name}"
         raise ConfigError(f"checkpoint: expected {wanted}, found none")
-    learned = None if checkpoint is None else Twin.load(checkpoint, device)
+    with given_as("checkpoint"):
+        learned = None if checkpoint is None else Twin.load(checkpoint, device)
     if name != "truth":
         return Simulator(name, learned, "adapted" if name == "learned" else "prior")
     known = {"name": scene} if scene is not None else scene_of(learned, checkpoint)

@@ -11,6 +11,7 @@ from warnings import warn
 
 import torch
 
+from mosa.config.checkpoints import given_as
 from mosa.data.formats.footage import read_json
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.law_stress import described, in_double, operator
@@ -42,7 +43,8 @@ def read_source(path: str | Path, nu: float | None = None) -> Source:
         if (note := read_json(path).get("note")) and nu is None:
             warn(f"{path}: {note}", stacklevel=1)
         return found
-    twin = Twin.load(path)
+    with given_as("source"):
+        twin = Twin.load(path)
     if float((field := twin.material.field).std()) > UNEVEN:
         low, mean, high = (float(v) for v in (field.min(), field.mean(), field.max()))
         warn(
@@ -104,6 +106,8 @@ def source(material: Material, adapter: object, nu: float | None = None) -> Sour
         raise ConfigError(f"export: expected a run with adapter=operator or none, {other}")
     material = in_double(material, configured=False)
     if nu is not None:
+        if adapter is not None and not adapter.numbers.any():
+            adapter = None  # kept isotropic: it adds nothing at any nu
         set_poisson(material, adapter, nu)
     adapter = None if adapter is None else adapter.double()
     values: dict[str, float] = {}

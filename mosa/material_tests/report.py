@@ -181,6 +181,8 @@ def table(
             "other_reading",
         )
         said = f"{value:.4g}" if plain else f"{float(value) / scale:.4g} {unit}"
+        if name == "R2" and math.isnan(float(value)):
+            said = "none: no test has stresses that vary"
         lines.append(f"- {name}: {said}")
     lines += [f"- {reading(fit)}", ""]
     lines += ["| number | value | standard deviation | unit |", "|---|---|---|---|"]

@@ -93,15 +93,27 @@ def check_splats(values: Mapping[str, Any], overrides: Iterable[str] = ()) -> Sp
         if float((viewed_from(settings.film.view, up, name="film.view") @ up).max()) < 0:
             below = f"looks from below the object, as up is {settings.up}"
             warnings.warn(f"film.view: {settings.film.view} {below}", stacklevel=2)
+    task = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()
+    words = [w for w in (*overrides, *task) if re.match(r"[+~]*(prior|adapter|ckpt_path)\b", w)]
     if settings.preset is not None:
         preset(settings.preset)
-        task = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()
-        words = [*overrides, *task]
-        if also := [w for w in words if re.match(r"[+~]*(prior|adapter|ckpt_path)\b", w)]:
+        if words:
             raise ConfigError(
-                f"preset: {settings.preset} is a law with all its values, found {' '.join(also)} beside it, "
-                "which choose another: leave out the one or the other"
+                f"preset: {settings.preset} sets the law and all its values: expected no prior, adapter or ckpt_path "
+                f"beside it, found {' '.join(words)}; leave out preset={settings.preset} or the rest"
             )
+    elif settings.ckpt_path is not None:
+        if idle := [w for w in words if "ckpt_path" not in w.partition("=")[0]]:
+            warnings.warn(
+                f"{' '.join(idle)}: no effect here: the object gets the law of ckpt_path",
+                stacklevel=2,
+            )
+    elif settings.adapter.name is not None:
+        warnings.warn(
+            "adapter: no effect here: nothing is learned from a file of Gaussians, and the object gets the prior's law "
+            "alone; ckpt_path=<run folder>/checkpoints/last.ckpt gives it one that was learned",
+            stacklevel=2,
+        )
     colliders_from_config(settings.colliders or (), "colliders")
     if settings.simulation.particles != "auto":
         check_particles("simulation.particles", settings.simulation.particles)

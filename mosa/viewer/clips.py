@@ -16,6 +16,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
+from mosa.config.checkpoints import given_as
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body.body import World
 from mosa.physics.contact.colliders import Shape
@@ -310,7 +311,8 @@ def shown_body(folder: Path, checkpoint: str | Path | None) -> ShownBody:
             f"{folder}: expected checkpoints/last.ckpt of a run, or body.npz of an exported motion, found neither; "
             "checkpoint=<run folder>/checkpoints/last.ckpt names the run's"
         )
-    twin = Twin.load(path)
+    with given_as("run" if checkpoint is None else "checkpoint"):
+        twin = Twin.load(path)
     return ShownBody.of(twin.body, twin.world)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from mosa.config.checkpoints import given_as
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation.analysis.marker_figures import MEASURED, PREDICTED
 from mosa.system.console import begin_log
@@ -271,7 +272,9 @@ def opened(chosen: Mapping[str, str | None]) -> Viewer | LiveViewer:
     place = {"host": chosen["host"], "port": int(chosen["port"])}
     if chosen["live"] == "true":
         path = checkpoint_of(chosen["run"], chosen["checkpoint"])
-        return LiveViewer(Live(Twin.load(path, named_device(chosen["device"]))), **place)
+        with given_as("checkpoint" if chosen["checkpoint"] else "run"):
+            twin = Twin.load(path, named_device(chosen["device"]))
+        return LiveViewer(Live(twin), **place)
     return Viewer(read_run(chosen["run"], chosen["checkpoint"]), **place)
 
 

@@ -1,5 +1,8 @@
 """Whole objects among hands and mistakes, exposures that change, masks of other programs."""
 
+import warnings
+
+import cv2
 import numpy as np
 import pytest
 from filming import filmed
@@ -64,6 +67,18 @@ def test_plates_and_masks_are_asked_for_by_name(tmp_path):
     (tmp_path / "phone1.mp4").write_bytes(b"no video")
     with pytest.raises(DataError, match=r"phone1\.mp4: expected a video"):
         open_clip(tmp_path / "phone1.mp4")
+
+
+def test_a_plate_in_the_folder_wins_over_plate_seconds_and_says_so(tmp_path):
+    clip = Clip(tmp_path / "phone1.mp4", np.arange(10) / 60, (80, 60), 0, 0.0)
+    cv2.imwrite(str(tmp_path / "phone1.png"), np.full((60, 80, 3), 51, np.uint8))
+    with pytest.warns(
+        UserWarning, match=r"^plate_seconds: has no effect on phone1\.mp4, .*phone1\.png"
+    ):
+        found = plate_of(tmp_path, clip, (0.0, 0.1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.array_equal(plate_of(tmp_path, clip, None), found) and np.allclose(found, 0.2)
 
 
 def test_mask_videos_are_read_with_their_frames(tmp_path):

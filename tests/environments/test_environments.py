@@ -436,6 +436,8 @@ def test_a_picture_shows_the_body_on_its_box():
 
 def test_a_checkpoint_that_does_not_say_its_scene_is_named(monkeypatch):
     """One line that names file and field; with a scene that is named it is not asked."""
+    with pytest.raises(DataError, match=r"^checkpoint: old\.ckpt: no such file"):
+        simulator_named("learned", "old.ckpt")
     learned = SimpleNamespace(record=SimpleNamespace(settings={}))
     monkeypatch.setattr(arenas.Twin, "load", lambda *a: learned)
     with pytest.raises(

@@ -176,8 +176,20 @@ def test_a_law_is_exported_as_nearly_incompressible():
     assert Specimens(data, False).predict(usual, None) != pytest.approx(kept, rel=0.05)
     with pytest.raises(ConfigError, match="nu: expected a number of at least 0 and below"):
         source(Material("neo_hookean", law), None, 0.5)
+    isotropic, learned = HyperelasticAdapter(), HyperelasticAdapter()
+    with torch.no_grad():
+        learned.numbers[0] = 0.1
+    for adapter in (isotropic, learned):
+        adapter.switch_on(1e5, 0.45)
+    kept = source(Material("neo_hookean", law), isotropic, 0.499)
+    assert kept.values == source(Material("neo_hookean", law), None, 0.499).values
     with pytest.raises(ConfigError, match="found a learned stiffness"):
-        source(Material("neo_hookean", law), HyperelasticAdapter(), 0.499)
+        source(Material("neo_hookean", law), learned, 0.499)
+
+
+def test_a_wrong_checkpoint_is_named_by_the_command_s_argument(tmp_path):
+    with pytest.raises(DataError, match=r"^source: .*gone\.ckpt: no such file"):
+        read_source(tmp_path / "gone.ckpt")
 
 
 def test_an_energy_of_another_package_is_exported(tmp_path, monkeypatch, capsys):

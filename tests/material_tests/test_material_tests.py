@@ -23,9 +23,11 @@ from mosa.material_tests.report import (
     mean_explained,
     reading,
     rms,
+    table,
     uncertain,
     written,
 )
+from mosa.material_tests.run import build_law
 from mosa.material_tests.specimen import Specimens
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import Material
@@ -112,6 +114,9 @@ def test_a_test_of_a_single_state_is_fitted():
     data = measurements(states, "Pa", "here")
     fit = Fitting(law, data, False, starts=1, seed=0).fit()
     assert fit.predicted == pytest.approx([1e3], rel=1e-3) and np.isfinite(fit.covariance).all()
+    page = table(law, data, fit, {}, "Pa").splitlines()
+    assert page[-1].startswith("| uniaxial x | 1 | ") and page[-1].endswith(" |  |  |")
+    assert "- R2: none: no test has stresses that vary" in page
 
 
 def test_as_many_stresses_as_numbers_say_nothing_of_their_noise():
@@ -511,6 +516,14 @@ def test_what_cannot_be_fitted_is_said():
     run = call("mosa/material_tests/__main__.py", *words)
     assert run.returncode != 0 and "none.csv" in run.stdout + run.stderr
     assert "symmetry: has no effect in this run" in run.stdout + run.stderr
+
+
+def test_a_refused_adapter_is_not_called_by_its_internal_name():
+    """adapter=mosa and adapter=linear are both `stress` inside."""
+    prior = {"law": "neo_hookean", "parameters": {"E": E, "nu": NU}}
+    with pytest.raises(ConfigError, match=r"^adapter: expected operator or none") as refused:
+        build_law({"prior": prior, "adapter": {"name": "stress"}})
+    assert "stress" not in str(refused.value)
 
 
 def test_heart_muscle(reference_data):

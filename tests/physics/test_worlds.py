@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 
@@ -64,6 +65,20 @@ def test_particles_at_rest():
     )
     for part, whole in zip(one.__dict__.values(), both.worlds()[0].__dict__.values(), strict=True):
         assert torch.equal(part, whole) and part.dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    ("x", "found"),
+    [
+        (np.zeros((5, 3)), "ndarray"),
+        (torch.zeros(3, 5), r"torch\.float32 \(3, 5\)"),
+        (torch.zeros(3), r"torch\.float32 \(3,\)"),
+        (torch.zeros(5, 3, dtype=torch.long), r"torch\.int64 \(5, 3\)"),
+    ],
+)
+def test_other_places_than_particles_at_rest_are_refused(x, found):
+    with pytest.raises(ConfigError, match=rf"^x: expected a torch tensor .*, found {found}$"):
+        ParticleState.at_rest(x)
 
 
 def alone(world, start, law, order=slice(None)):

@@ -280,5 +280,21 @@ def test_a_view_from_below_is_said():
 def test_a_preset_beside_another_law_is_refused(words):
     values = {**LAW, "ply": "a.ply", "preset": "jelly"}
     check_splats(values, ["preset=jelly", "simulation.particles=100"])
-    with pytest.raises(ConfigError, match=f"^preset: jelly is a law .* found {' '.join(words)} be"):
+    with pytest.raises(
+        ConfigError, match=f"^preset: jelly sets .*, found {' '.join(words)}; leave"
+    ):
         check_splats(values, ["preset=jelly", *words])
+
+
+def test_a_law_that_changes_nothing_is_said():
+    """An adapter without a checkpoint is the prior; beside one the prior's and the adapter's keys are not read."""
+    values, operator = {**LAW, "ply": "a.ply"}, {"adapter": {"name": "hyperelastic"}}
+    learned = {"ckpt_path": "a.ckpt"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_splats(values, ["prior=corotated"])
+        check_splats(values | learned, ["ckpt_path=a.ckpt"])
+    with pytest.warns(UserWarning, match="^adapter: no effect here: .* ckpt_path="):
+        check_splats(values | operator, ["adapter=operator"])
+    with pytest.warns(UserWarning, match="^adapter=operator: no effect here: .* ckpt_path$"):
+        check_splats(values | operator | learned, ["ckpt_path=a.ckpt", "adapter=operator"])

@@ -30,6 +30,7 @@ from mosa.viewer.pages import FIELD_OF_VIEW, beside_panel, own_page, view_of
 
 N, T, SEEN = 27, 5, 3
 GROUND = -0.2
+LOAD = Twin.load
 
 
 def rollout(shift: float) -> Rollout:
@@ -305,6 +306,17 @@ def test_what_is_to_be_shown_is_asked_for_on_the_command_line(run, monkeypatch):
         viewer.options([str(run), "live=yes"])
     pytest.importorskip("viser")
     twin = Twin.load("")
+    monkeypatch.setattr(Twin, "load", LOAD)
+    for given, argument in (([str(file)], "run"), ([f"checkpoint={file}"], "checkpoint")):
+        with pytest.raises(
+            DataError, match=rf"^{argument}: .*last\.ckpt: not a readable checkpoint"
+        ):
+            viewer.opened(viewer.options([*given, "--live"]))
+    for given, argument in ((None, "run"), (file, "checkpoint")):
+        with pytest.raises(
+            DataError, match=rf"^{argument}: .*last\.ckpt: not a readable checkpoint"
+        ):
+            read_run(run, given)
     monkeypatch.setattr(Twin, "load", lambda path, device="cpu": twin)
     monkeypatch.setattr(
         twin, "training_start", replace(twin.training_start, center=torch.tensor([0.0, 0.2, 0.0]))

@@ -208,11 +208,12 @@ class SegmentSolver:
             OUTSIDE: f"position is outside the box {list(numerics.box[0])} to {list(numerics.box[1])} m",
             INVERTED: f"det F <= 0, which {inverted}",
         }[event]
-        remedy = "use more substeps, or parameters nearer to the calibrated ones"
+        more = "use more substeps (a smaller simulation.courant of a run, or substeps= of a twin)"
+        remedy = f"{more}, or parameters nearer to the calibrated ones"
         if event == OUTSIDE:
             remedy = (
-                "use a larger box (scene.box of a run, box= of a twin), or another start: a velocity that is not given is "
-                "the training's"
+                f"if the body flew apart, {more}; if it left whole, a larger box (scene.box of a run, box= of a twin), or "
+                "another start: a velocity that is not given is the training's"
             )
         return SimulationDiverged(
             f"{self._named(world)}substep {substep}, particle {particle}: {what} (dt {dt:.3g} s, dx {numerics.dx:.3g} m); {remedy}"

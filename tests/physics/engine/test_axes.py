@@ -300,3 +300,20 @@ def test_worlds_that_are_far_from_each_other_are_refused(make_block):
         Simulator("neo_hookean", dx=DX, substeps=1, frame_dt=1e-3, dtype=torch.float64).rollout(
             replace(both, x=both.x + apart), PARAMETERS, torch.full((len(state.x),), 8e-6).double(), 1000.0, 2
         )  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:.*det F <= 0")
+def test_a_body_that_flies_apart_is_given_more_substeps_before_a_larger_box(make_block):
+    """An unstable time step throws particles out of any box."""
+    state = make_block()
+    box = torch.stack([state.x.amin(0) - 0.3, state.x.amax(0) + 0.3])
+    coarse = Simulator(
+        "corotated", dx=DX, substeps=2, frame_dt=1 / 60, dtype=torch.float64, box=box
+    )
+    moduli, volume = {"mu": 1e6, "lam": 1e6}, torch.full((len(state.x),), 1e-5).double()
+    nudged = replace(state, v=state.v + 0.1 * state.x.cos())
+    with pytest.raises(
+        SimulationDiverged,
+        match=r"outside the box .*\(dt 0\.00833 s.*simulation\.courant.* larger box",
+    ):
+        coarse.rollout(nudged, moduli, volume, 1000.0, 60)
