@@ -196,6 +196,7 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
     if scene.last_free_frame is not None:
         free = min(free, scene.last_free_frame + 1)
     if free < 3:
+        check_sideways(track, label, g, down)
         check_flight(track, aloft, label, g, down, keys)
         return
     a, error = parabola(track, free)
@@ -215,6 +216,23 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
             f"{found} along the stated gravity of {g:.3g}, and with {across:.3g} across, which so few frames may "
             f"excuse: check {keys}",
             stacklevel=4,
+        )
+
+
+def check_sideways(track: Track, label: str, g: float, down: Tensor) -> None:
+    """A warning where too few frames are above the stated ground and the object falls first, as fast as gravity says, along that
+    ground: what it strikes or rubs on seldom does just that."""
+    if len(track.points) < 3:
+        return
+    a, error = parabola(track, 3)
+    along = float(a @ down)
+    across = a - along * down
+    if error < 3 * g and abs(along) < ASIDE * g and abs(float(across.norm()) - g) < ASIDE * g:
+        found = [round(float(x), 1) for x in across]
+        warnings.warn(
+            f"{label}: in the first three frames the object falls with about {found} m/s^2, across the stated gravity of "
+            f"{g:.3g}: is another axis up? check scene.up, scene.gravity and the axes of the poses",
+            stacklevel=5,
         )
 
 

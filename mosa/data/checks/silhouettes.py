@@ -33,6 +33,10 @@ STRAY, LOST = 0.3, 0.6
 """Radii from the middle of the true particles to where the cameras see the object, from which on they are warned of, and refused.
 Of the built-in films it is at most 0.1."""
 
+SHARED, DARK = 20, 0.02
+"""Points of the hull that a camera and others show at least where their brightness is compared; brightness, of 0 to 1, below which
+pixels are alike."""
+
 
 def check_particles(scene: Scene, label: str) -> None:
     """True particles lie where the cameras see the object, in every frame. Errors: DataError naming scene.particles and frame."""
@@ -146,6 +150,40 @@ def check_outlines(scene: Scene, label: str) -> None:
         raise DataError(worst[1])
     if worst[0] > SUSPECT:
         warnings.warn(worst[1], stacklevel=3)
+
+
+def shared_brightness(scene: Scene, frame: int) -> Tensor:
+    """Logarithm (V,) of how bright each camera shows the object, over how bright others show the same points of its hull at the
+    same moment; NaN where none does. A body that turns another side to a camera leaves it, an exposure of one camera does not."""
+    found = torch.full((len(scene.cameras),), torch.nan)
+    views = whole_views(scene, frame)
+    if len(views) < 3:
+        return found
+    cameras, mattes = scene.cameras.select(views), scene.mattes[views, frame]
+    try:
+        points, pitch = hull_points(mattes, cameras, scene.box)
+    except DataError:
+        return found
+    if not len(points):
+        return found
+    shown = []
+    for v, K, pixels, depth in zip(views, cameras.K, *project(points, cameras)):
+        place = (pixels / (1.5 * pitch * K[0, 0] / depth.mean())).floor().long()
+        place -= place.amin(0)
+        cells = place[:, 0] * (place[:, 1].max() + 1) + place[:, 1]
+        first = torch.full((int(cells.max()) + 1,), torch.inf)
+        first = first.scatter_reduce(0, cells, depth, "amin")
+        column, row = pixels.floor().long().T
+        at = row.clamp(0, cameras.height - 1), column.clamp(0, cameras.width - 1)
+        front = (depth < first[cells] + pitch) & (scene.mattes[v, frame][at] > 0.9)
+        light = scene.images[v, frame][at].mean(1).clamp(min=DARK).log()
+        shown.append(torch.where(front, light, torch.nan))
+    light = torch.stack(shown)
+    seen = (~light.isnan()).sum(0)
+    beside = (light - (light.nansum(0) - light) / (seen - 1)).where(seen > 1, torch.nan)
+    enough = (~beside.isnan()).sum(1) >= SHARED
+    found[views] = beside.nanmean(1).where(enough, torch.nan)
+    return found
 
 
 def lowest_turn(heights: Tensor, noise: float) -> int:

@@ -126,6 +126,17 @@ def test_a_gravity_that_the_object_does_not_follow_is_refused(scene):
         )
 
 
+def test_a_fall_along_a_ground_that_the_object_straddles_is_said():
+    scene, aside = ball(size=128), torch.tensor([1.0, 0.0, 0.0])
+    short = replace(reordered(scene, list(range(3))), times=scene.times[:3])
+    with pytest.warns(UserWarning, match=r"falls with about .* across .* check scene\.up"):
+        check_fall(replace(short, up=aside, gravity=-9.8 * aside), "scene")
+    for ground in (0.0, 0.4):  # above it, and straddling
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            check_fall(replace(short, ground=Ground(ground)), "scene")
+
+
 @pytest.mark.parametrize("tick", [1.0, 1 / FPS * 1e3])
 def test_a_clock_of_frames_or_milliseconds_is_refused_where_two_frames_fall(scene, tick):
     short = reordered(scene, list(range(7, FRAMES)))

@@ -18,7 +18,7 @@ from mosa.data.checks.tangents import check_copies, check_pictures
 from mosa.data.checks.validation import check_colors, validate
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
-from mosa.rendering.cameras import look_at
+from mosa.rendering.cameras import centers, look_at
 from mosa.types import Cameras
 
 WORLD = {
@@ -221,13 +221,42 @@ SPOILED = {
 }  # fmt: skip
 
 
-def test_an_exposure_of_one_camera_that_changes_is_said(scene):
-    scene = replace(scene, images=scene.images.clone())
-    scene.images[3] *= torch.linspace(1, 0.6, 5)[:, None, None, None]
-    with pytest.warns(
-        UserWarning, match="camera 3: the object's brightness, over .* factor of 1.[4-6]"
-    ):
+def tumbling(scene):
+    """The scene with a ball of one dark and one bright side, which turns half round a level axis."""
+    cameras, middle, radius = scene.cameras, torch.tensor([0.0, 0.165, 0.0]), 0.15
+    y, x = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    rays = torch.stack([x, y, torch.ones_like(x)], -1) @ torch.linalg.inv(cameras.K).mT[:, None]
+    rays = torch.nn.functional.normalize(rays @ cameras.w2c[:, None, :3, :3], dim=-1)
+    away = (centers(cameras) - middle)[:, None, None]
+    along = (rays * away).sum(-1)
+    root = along.square() - away.square().sum(-1) + radius**2
+    normals = (away + (-along - root.clamp(min=0).sqrt())[..., None] * rays) / radius
+    sides = [torch.tensor([math.cos(a), math.sin(a), 0.0]) for a in torch.linspace(0, math.pi, 5)]
+    light = torch.stack([0.5 + 0.2 * normals @ side for side in sides], 1)
+    mattes = (root > 0).float()[:, None].expand(-1, 5, -1, -1).contiguous()
+    images = light[..., None] * mattes[..., None] + scene.background * (1 - mattes[..., None])
+    return replace(scene, images=images, mattes=mattes)
+
+
+@pytest.mark.parametrize("kind", ["as it is", "tumbling"])
+@pytest.mark.parametrize("faded", [None, 0, 3])
+def test_an_exposure_of_one_camera_that_changes_is_said_and_a_body_that_tumbles_is_not(
+    scene, kind, faded
+):
+    scene = tumbling(scene) if kind == "tumbling" else replace(scene, images=scene.images.clone())
+    if faded is not None:
+        scene.images[faded] *= torch.linspace(1, 0.8, 5)[:, None, None, None]
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
         check_colors(scene, "film")
+    told = [str(each.message) for each in found]
+    if faded is None:
+        assert not told
+    else:
+        assert len(told) == 1
+        assert re.search(
+            f"camera {faded}: the object's brightness, over .* factor of 1.[23]", told[0]
+        )
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,9 @@ def test_a_person_reads_how_sure_the_body_is(scene, particles):
         "3.1% of the visual hull is air. 7.2% of the surface is not determined by the images"
         in geometry_lines(figures)
     )
+    hidden = figures | {"geometry/uncertain_share": 0.531, "geometry/volume_m3": 7.279e-3}
+    said = "Mass and moduli are those of a body of 7279 cm^3, and **are wrong if the real volume"
+    assert said in geometry_lines(hidden) and "moduli" not in geometry_lines(figures)
     assert "left out; no refinement by colours" in geometry_lines({"geometry/carved_share": 0.02})
     assert "0.00% of the particles outside" in geometry_lines(geometry_figures(*particles, scene))
     assert geometry_lines({}) == ""
