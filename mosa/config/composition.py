@@ -143,8 +143,9 @@ def said_of(error: BaseException, given: Sequence[str] = ()) -> str:
             said = f"{key}: expected one of {', '.join(options)}, found null; {way}"
     if found := re.search(r"\.\nTo append to your config use \+([\w.]+)=.*", said):
         key = found[1]
-        if inner := re.search(r"\nKey '([^']+)' is not in struct", said):  # in a whole section
-            whole = key if inner[1] in key.split(".") else f"{key}.{inner[1]}"
+        inner = re.search(r"\nKey '([^']+)' is not in struct", said)
+        if inner and inner[1] not in key.split("."):  # of a section that was given as a whole
+            whole = f"{key}.{inner[1]}"
             said, key = said.replace(inner[0], "").replace(f"'{key}'", f"'{whole}'"), whole
         said = said.replace(found[0], f"{way_out(key)}.")
     return said[:2000]
