@@ -26,6 +26,7 @@ LIGHT, HEAVY = 0.5, 30.0
 SURE, SUSPECT = 2.0, 1.3
 """Factors of an acceleration or an energy from which on data are refused, and warned of, where noise cannot explain it. Free frames
 of the built-in scenes and the bird fall with 0.93 to 1.07 of the stated gravity, and end with at most 1.01 of their energy."""
+HELD = "of a film that starts at rest, held or in contact, say scene.start=rest"
 ODD, ASIDE = 1.6, 0.25
 """Factor of the acceleration, and its share across gravity, that is said even where the noise assumed could explain it. That noise
 is cautious: in the films above, three frames alone find gravity to 9 %, with 0.1 of it across."""
@@ -206,8 +207,7 @@ def check_rate(scene: Scene, track: Track, label: str, g: float) -> None:
     slow = along < g / SURE and along + error < g / SUSPECT
     if slow or across - error > g / SURE:
         raise DataError(
-            f"{found} along the stated gravity of {g:.3g}, and moves with {across:.3g} across: check {keys}; "
-            "of a film that starts at rest, held or in contact, say scene.start=rest"
+            f"{found} along the stated gravity of {g:.3g}, and moves with {across:.3g} across: check {keys}; {HELD}"
         )
     if (along < g / SUSPECT and along + error < g) or (along > SUSPECT * g and along - error > g):
         warnings.warn(f"{found}, under a stated gravity of {g:.3g}: check {keys}", stacklevel=4)
@@ -248,7 +248,8 @@ def check_flight(
     if bool((aloft[1:] & aloft[:-1]).any()) and rise > shown:
         raise DataError(
             f"{label}: the object is aloft in frames that are {track.dt:.3g} s apart, between which it would rise and fall by "
-            f"{rise:.3g} m; the heights that the film shows differ by {shown:.3g} m: expected times in seconds; check {keys}"
+            f"{rise:.3g} m; the heights that the film shows differ by {shown:.3g} m: expected times in seconds; check {keys}; "
+            f"{HELD}"
         )
     runs = (list(run) for _, run in groupby(range(len(aloft)), aloft.tolist().__getitem__))
     flight = max((run for run in runs if aloft[run[0]]), key=len, default=[])

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import InstanceOf
+from torch import Tensor
 
 from mosa.data.checks.cameras import check_agreement, check_hues, holes_report
 from mosa.data.checks.free_fall import check_fall
@@ -295,6 +296,12 @@ def check_gaps(scene: Scene, seen: torch.Tensor, label: str) -> None:
                       "nothing being there", stacklevel=4)  # fmt: skip
 
 
+def spread(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of each row of values (V, T) the highest less the lowest, and where they are, (V,) each. NaN is left out."""
+    high, low = values.nan_to_num(-math.inf).max(1), values.nan_to_num(math.inf).min(1)
+    return high.values - low.values, high.indices, low.indices
+
+
 def check_colors(scene: Scene, label: str) -> None:
     """A warning where the object's mean colour jumps in one frame of a camera and comes back: a frame that was not exposed, or
     dropped and filled with black. And one where a camera's or all cameras' changes over the film: another exposure or light."""
@@ -315,17 +322,14 @@ def check_colors(scene: Scene, label: str) -> None:
         return
     whole = seen & ~(at_border(scene.mattes) > 0.5)
     light = torch.where(whole & (whole.sum(0) > 2), means.mean(2).clamp(min=DARK).log(), torch.nan)
-    light -= light.nanmean(0)
-    high, low = light.nan_to_num(-math.inf), light.nan_to_num(math.inf)
-    turns = high.amax(1) - low.amin(1) > TURNS
-    if bool(turns.any()):
-        ends = (high.argmax(1)[turns].tolist(), low.argmin(1)[turns].tolist())
-        frames = sorted({0, scene.frames - 1}.union(*ends))
+    change, *ends = spread(light - light.nanmean(0))
+    if bool((turns := change > TURNS).any()):
+        frames = sorted({0, scene.frames - 1}.union(*(each[turns].tolist() for each in ends)))
         shared = torch.stack([shared_brightness(scene, frame) for frame in frames], 1)
-        high, low = shared.nan_to_num(-math.inf), shared.nan_to_num(math.inf)
-        v = int((change := high.amax(1) - low.amin(1)).argmax())
+        change, *ends = spread(shared)
+        v = int(change.argmax())
         if float(change[v]) > FADES:
-            first, last = sorted((frames[int(high[v].argmax())], frames[int(low[v].argmin())]))
+            first, last = sorted(frames[int(each[v])] for each in ends)
             warnings.warn(
                 f"{label}: camera {scene.cameras.names[v]}: the object's brightness, over that in which other cameras show the "
                 f"same points, changes by a factor of {math.exp(float(change[v])):.3g} between frames {first} and {last}: an "

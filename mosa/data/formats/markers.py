@@ -31,6 +31,9 @@ FOUND = {AUTO: released, "swing": swung}  # how scene.start is found
 MOST_FRAMES = 100_000
 MISALIGNED = 0.1  # of the points' extent: a distance (rms) of aligned points that is refused
 LEAST_SPAN, MOST_SPAN = 0.01, 3.0  # distances of tracked points over the body's size
+FARTHEST = (
+    1e9  # mm from a surface, beyond which it was not measured: outside of the lattice around a mesh
+)
 WIDE = 3.0  # the world reaches so many sizes of the body beyond it
 
 
@@ -105,10 +108,12 @@ def load_markers(
     position, turn = pose_of(solid)
     apart = 1e3 * signed_distance(solid.shape, (at_rest.double() - position) @ turn).sort().values
     log.info(
-        "%s: at rest the points are %.1f to %.1f mm from the body's surface (negative: inside)",
+        "%s: at rest the points are %s to %s mm from the body's surface (negative: inside)",
         Path(path).name,
-        apart[0],
-        apart[-1],
+        *(
+            f"{each:.1f}" if each < FARTHEST else f"more than {1e3 * solid.shape.margin:.0f}"
+            for each in apart[[0, -1]]
+        ),
     )
     low, high = corners(solid)
     far = WIDE * (across := float((high - low).max()))

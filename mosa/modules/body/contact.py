@@ -77,9 +77,11 @@ class ContactOffset(nn.Module):
 
     def at_limit(self, ground: Ground | None, dx: float) -> bool:
         """Whether a fit ended on a bound: the true contact is beyond it, or other errors look like one that is."""
-        bounds = {each for free in (True, False) for each in self.prior(ground, dx, free)[1]}
-        known = ground is not None and self.enabled
-        return known and any(abs(float(self.cells.detach()) - each) < ON_BOUND for each in bounds)
+        if ground is None or not self.enabled:
+            return False
+        cells = float(self.cells.detach())
+        bounds = (each for free in (True, False) for each in self.prior(ground, dx, free)[1])
+        return any(abs(cells - each) < ON_BOUND for each in bounds)
 
     @torch.no_grad()
     def project(self) -> None:

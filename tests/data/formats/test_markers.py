@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 import yaml
 from omegaconf import OmegaConf
 from small_bodies import FREE, NU, E, small_body
@@ -248,6 +249,12 @@ def test_how_far_points_are_from_the_surface_is_said(tmp_path, caplog):
     caplog.set_level("INFO")
     load_scene(format="markers", path=str(path), body=BOX | {"position": [0, 0.02, 0]}, density=1e3)
     assert "at rest the points are -20.0 to 0.0 mm from the body's surface" in caplog.text
+    # a mesh has distances on a lattice around it alone
+    trimesh.creation.box(BOX["size"]).export(tmp_path / "a.obj")
+    for height, said in ((0.02, "to 0.0 mm"), (-0.2, "to more than 67 mm")):
+        mesh = {"type": "mesh", "path": "a.obj", "position": [0, height, 0]}
+        load_scene(format="markers", path=str(path), body=mesh, density=1e3)
+        assert said in caplog.text.rpartition("at rest the points are")[2]
 
 
 def test_a_turned_body_is_as_thick_as_it_is_upright(tmp_path):
