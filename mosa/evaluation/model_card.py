@@ -8,7 +8,7 @@ from collections.abc import Sequence as Ordered
 import torch
 from torch import Tensor
 
-from mosa.evaluation.analysis import tables
+from mosa.evaluation.analysis import statements, tables
 from mosa.evaluation.evaluate import SAME, Sequence
 from mosa.modules.body.body import Body
 from mosa.physics.world import World
@@ -108,12 +108,12 @@ def model_card(
         f"{1e3 * body.size:.4g} mm long and has {1e6 * float(body.volume.sum()):.4g} cm^3."
     )
     unsure = "This fit keeps no posterior: how sure the law is, is not known."
-    doubt = tables.unexplained_text(figures, world)
+    doubt = statements.unexplained_text(figures, world)
     errors = (note, doubt, tables.results_table(figures), tables.columns_text(figures, name))
     parts = {
         "What was filmed": "\n".join(filmed(sequences)),
         "What was learned": f"{learned}\n\n{tables.parameter_table(figures, law)}",
-        "What is determined, and what is not": tables.determined_text(figures, law) or unsure,
+        "What is determined, and what is not": statements.determined_text(figures, law) or unsure,
         "Errors": "\n\n".join(filter(None, errors)),
         "Where it is valid": "\n".join(valid(sequences, kept, body, world)),
         "Licence": LICENCE,

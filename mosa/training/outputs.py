@@ -23,16 +23,14 @@ from mosa.evaluation.analysis.comparison import (
     write_comparisons,
 )
 from mosa.evaluation.analysis.marker_figures import write_markers
-from mosa.evaluation.analysis.tables import (
-    columns_text,
+from mosa.evaluation.analysis.statements import (
     determined_text,
     force_lines,
     geometry_lines,
-    parameter_table,
-    results_table,
     unexplained_text,
     worse_text,
 )
+from mosa.evaluation.analysis.tables import columns_text, parameter_table, results_table
 from mosa.evaluation.evaluate import (
     Sequence,
     evaluate,

@@ -15,8 +15,8 @@ from mosa.data.formats.scene_from_footage import check_density
 from mosa.errors import ConfigError
 from mosa.evaluation.analysis.anisotropy import mandel_matrix, mandel_scale
 from mosa.evaluation.analysis.law_stress import in_double, tangent, values_of
+from mosa.evaluation.analysis.statements import NOTICEABLE
 from mosa.evaluation.analysis.stiffness import stiffest
-from mosa.evaluation.analysis.tables import NOTICEABLE
 from mosa.evaluation.uncertainty import determined
 from mosa.modules.adapters.microplane import PAIRS
 from mosa.modules.body.body import Body

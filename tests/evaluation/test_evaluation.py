@@ -10,7 +10,7 @@ from small_bodies import DX, STICKY, small_body
 from mosa.errors import SimulationDiverged
 from mosa.evaluation import evaluate as evaluation
 from mosa.evaluation import floor, metrics
-from mosa.evaluation.analysis.tables import determined_text
+from mosa.evaluation.analysis.statements import determined_text
 from mosa.evaluation.evaluate import (
     Sequence,
     evaluate,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mosa.evaluation import metrics
-from mosa.evaluation.analysis.tables import unexplained_text
+from mosa.evaluation.analysis.statements import unexplained_text
 from mosa.types import Ground, MarkerCues, MotionCues
 
 

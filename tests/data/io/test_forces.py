@@ -19,7 +19,7 @@ from mosa.data.io.forces import (
     warn_of_clock,
 )
 from mosa.errors import ConfigError, DataError
-from mosa.evaluation.analysis.tables import force_lines
+from mosa.evaluation.analysis.statements import force_lines
 from mosa.modules.fitting.identification import Identification
 from mosa.modules.fitting.identification_settings import Criterion, IdentificationSettings
 from mosa.modules.fitting.stages import Stage

@@ -10,7 +10,7 @@ from mosa.data.synthetic.bodies.shapes import SHAPES
 from mosa.data.synthetic.surface import fill
 from mosa.data.synthetic.true_geometry import geometry_figures, origin
 from mosa.errors import ConfigError
-from mosa.evaluation.analysis.tables import geometry_lines
+from mosa.evaluation.analysis.statements import geometry_lines
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,8 @@ from mosa.config.checkpoints import check_resumed
 from mosa.config.record import BodyRecord
 from mosa.data.scene import ground_from
 from mosa.errors import ConfigError, DataError, SimulationDiverged
-from mosa.evaluation.analysis.tables import (
-    determined_text,
-    ground_table,
-    ground_text,
-    parameter_table,
-)
+from mosa.evaluation.analysis.statements import determined_text, ground_table, ground_text
+from mosa.evaluation.analysis.tables import parameter_table
 from mosa.modules.body.body import World
 from mosa.modules.body.contact import ContactOffset
 from mosa.modules.body.material import Material
