@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.adapters.interface import Held, answer, unread
+from mosa.physics.adapters.interface import Held, steady_answer
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import stack_held
 from mosa.physics.engine.simulator import Simulator
@@ -91,7 +91,7 @@ class Ready:
             raise ConfigError(
                 f"adapter: expected one whose operator is the same in every state, found {type(adapter).__name__}"
             )
-        held = Held(answer(adapter, unread(self.simulator.law, self.state.F)))
+        held = Held(steady_answer(adapter, self.simulator.law, self.state.F))
         return replace(self, arguments={**self.arguments, "adapter": held})
 
     @classmethod

@@ -22,6 +22,7 @@ from torch.func import functional_call
 
 from mosa.physics.adapters.interface import ANSWER
 from mosa.physics.adapters.network_evaluation import at_hand
+from mosa.physics.engine.buffers import Pool
 from mosa.physics.engine.capture import ATTEMPTS, Graphs, TorchCapture
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.numerics import Numerics, State, Steps
@@ -244,7 +245,7 @@ class ChainOfSegments(Stretch):
         return differentiated  # a rollout with a backward pass has these buffers anyway
 
     def buffers(
-        self, solver: SegmentSolver, pool: dict, acting: Sequence[Tensor], full: bool
+        self, solver: SegmentSolver, pool: Pool, acting: Sequence[Tensor], full: bool
     ) -> tuple[Workspace, dict]:
         return self.chain.workspace(full), {"parameters": acting[0].detach()}
 

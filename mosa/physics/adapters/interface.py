@@ -75,10 +75,21 @@ def answer(adapter: Callable, state: Sequence[Tensor | None]) -> AdapterOperator
     return AdapterOperator(*found)
 
 
-def unread(law: Law, F: Tensor) -> MaterialState:
-    """Zeros in place of the state of N particles, for a `steady` adapter: its kernel is not compiled. F: (N, 3, 3)."""
-    zeros = F.new_zeros(len(F), 6)
-    return MaterialState(zeros, zeros, zeros if law.plastic else None)
+def steady_answer(adapter: Callable, law: Law, F: Tensor) -> AdapterOperator:
+    """What a `steady` adapter answers, asked of N particles without their state, whose kernel is not compiled. F: (N, 3, 3).
+
+    Errors: ConfigError where it reads the state: what comes of it is no number."""
+    none = F.new_full((len(F), 6), torch.nan)
+    found = answer(adapter, MaterialState(none, none, none if law.plastic else None))
+    if F.is_cuda and torch.cuda.is_current_stream_capturing():
+        return found  # as it was when it was not captured
+    for name, part in zip(ANSWER, found):
+        if torch.is_tensor(part) and not part[:1].isfinite().all():
+            raise ConfigError(
+                f"adapter output {name}: expected the same numbers in every state, as {type(adapter).__name__} says that it is "
+                "steady, found NaN where there is no state: let `steady` be False if it reads the state"
+            )
+    return found
 
 
 @dataclass(frozen=True)
@@ -99,8 +110,10 @@ def ask(
     """The adapter's answer by name, checked. into: as `material_state`."""
     n = len(F)
     steady = getattr(adapter, "steady", False)
-    state = unread(law, F) if steady else material_state(law, F, C, packed, into)
-    found = answer(adapter, state)
+    found = (
+        steady_answer(adapter, law, F) if steady
+        else answer(adapter, material_state(law, F, C, packed, into))
+    )  # fmt: skip
     plastic = (found.plastic_G, found.plastic_h) if law.plastic else (None, None)
     result = dict(zip(ANSWER, (found.G, found.h, *plastic)))
     for name, value in result.items():

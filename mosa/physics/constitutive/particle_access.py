@@ -5,8 +5,8 @@ transaction of its own on a GPU. Here 16 bytes are added at a time where the siz
 waits for that; pieces to which nothing is added are left alone, which costs nothing where the compiler sees that a law does not
 read them. Arrays must be contiguous and begin at a multiple of 16 bytes, see `launching.aligned`.
 
-An operator may be the same for many particles: it is read at a `place` that they share, and its gradient is added to each
-particle's own.
+An operator may be the same for many particles: it is read at a `place` that they share, and its gradient is added to row i, which
+several may share too.
 """
 
 from functools import cache
@@ -190,7 +190,8 @@ def particle_access(scalar, slots: int) -> SimpleNamespace:
     `place`; times66(field, i, place, x) -> the matrix at `place` times x; turned(field, i, block) -> whether block[i % LANES] is
     the polar rotation of matrix i, on a CPU alone.
 
-    scalar: of the fields, wp.float32 or wp.float64. No other thread may work on particle i, to whose gradients is added."""
+    scalar: of the fields, wp.float32 or wp.float64. Gradients are added to number i, on which no other thread may work but
+    in vector6 and times66."""
     name, size = {wp.float32: ("float", 4), wp.float64: ("double", 8)}[scalar]
 
     def pieces(count: int, width: int) -> dict:

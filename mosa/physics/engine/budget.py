@@ -23,12 +23,13 @@ def free_memory(device: torch.device) -> int:
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
-def room(device: torch.device, wanted: int, worlds: int = 1) -> float:
+def room(device: torch.device, wanted: int, worlds: int = 1, idle: int = 0) -> float:
     """Bytes that a rollout which could use `wanted` may keep between the passes: on a GPU all or nothing, so that a long rollout of
-    many particles stays small; on a CPU as much for each of its worlds as a rollout of one, within a share of the memory."""
+    many particles stays small; on a CPU as much for each of its worlds as a rollout of one, within a share of the memory. idle:
+    bytes of such states that the last rollout has left for the next."""
     if device.type != "cuda":
         return (
             KEPT_ON_CPU if worlds == 1 else min(worlds * KEPT_ON_CPU, KEPT_SHARE * machine_memory())
         )
-    available = KEPT_SHARE * free_memory(device)
+    available = KEPT_SHARE * (free_memory(device) + idle)
     return available if wanted < available else 0

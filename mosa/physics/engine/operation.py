@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mosa.physics.adapters.interface import ANSWER
 from mosa.physics.contact.motion import Poses
+from mosa.physics.engine.buffers import Pool
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.numerics import State, Steps
 from mosa.physics.engine.solver import WIDENED, LeftWindow, SegmentSolver, Windows
@@ -28,16 +29,16 @@ HELD = ("parameters", *ANSWER)
 
 @dataclass
 class Kept:
-    """What a forward pass leaves for the backward pass. windows: of the grid that it used; tape: `Workspace.tape`, [] where the
-    states are to be made again."""
+    """What a forward pass leaves for the backward pass. windows: of the grid that it used; states: as `SegmentSolver.keep`, []
+    where they are to be made again."""
 
     windows: Windows
-    tape: list[Tensor]
+    states: list[Tensor] | Workspace
 
-    def take(self) -> list[Tensor]:
-        """The tape, which is freed as soon as it is used: another pass makes the states again."""
-        tape, self.tape = self.tape, []
-        return tape
+    def take(self) -> list[Tensor] | Workspace:
+        """The states, which are let go as soon as they are used: another pass makes them again."""
+        states, self.states = self.states, []
+        return states
 
 
 @dataclass
@@ -73,7 +74,7 @@ class Stretch:
         return self.cut
 
     def buffers(
-        self, solver: SegmentSolver, pool: dict, acting: Sequence[Tensor | None], full: bool
+        self, solver: SegmentSolver, pool: Pool, acting: Sequence[Tensor | None], full: bool
     ) -> tuple[Workspace, dict]:
         """(the workspace, what is copied into it by name). full: with buffers for the adjoint."""
         held = dict(zip(HELD, acting, strict=True))
@@ -131,7 +132,7 @@ class Stretch:
         return (name, type(self), *(t is None for t in others))
 
     def _loaded(
-        self, solver: SegmentSolver, pool: dict, state: State, acting: Sequence[Tensor | None],
+        self, solver: SegmentSolver, pool: Pool, state: State, acting: Sequence[Tensor | None],
         poses: Sequence[Tensor], windows: Windows, full: bool,
     ) -> Workspace:  # fmt: skip
         work, held = self.buffers(solver, pool, acting, full)
@@ -152,7 +153,7 @@ class Stretch:
         # a cell per substep
         margins = (self.margin,) if self.cut else (self.margin, 3 + self.substeps // 2)
 
-        def run(solver: SegmentSolver, pool: dict, state: State, acting: tuple, poses: tuple):
+        def run(solver: SegmentSolver, pool: Pool, state: State, acting: tuple, poses: tuple):
             kept = differentiated and solver.has_room(self.substeps)
             full = self.full(differentiated, kept)
 
@@ -167,8 +168,8 @@ class Stretch:
                 fastest = int(work.flags[WINDOW])
                 raise LeftWindow if self.cut else solver.error(WINDOW, fastest, self.first, dt)
             left = [] if work.colliders is None else work.colliders.reaction
-            tape = solver.keep(work.tape()) if kept else []
-            return final, copies([*left, *self.statistics(work)]), Kept(windows, tape)
+            left = copies([*left, *self.statistics(work)])
+            return final, left, Kept(windows, solver.keep(work, pool) if kept else [])
 
         finals, left, kept = zip(
             *self.lanes.each(self._kind("advance", others), run, *self._parts(state, others))
@@ -183,11 +184,15 @@ class Stretch:
         """Gradients of (state, others), of as many states as there are seeds: without F_tot where the law does not yield."""
 
         def run(solver, pool, kept: Kept, state: State, acting, poses, seeds, other_seeds):
-            work = self._loaded(solver, pool, state, acting, poses, kept.windows, True)
-            tape = kept.take()
-            solver.room += sum(t.nbytes for t in tape)
-            if tape:
-                work.rewind(tape)
+            states = kept.take()
+            if isinstance(states, Workspace):  # as the forward pass left it
+                work = states
+                solver.take_back(work, pool)
+            else:
+                work = self._loaded(solver, pool, state, acting, poses, kept.windows, True)
+                solver.room += sum(t.nbytes for t in states)
+                if states:
+                    work.rewind(states)
             slots, statistics = work.adj_states, self.statistics_seeds()
             reaction, of_poses = [], []
             if work.colliders is not None:
@@ -201,7 +206,7 @@ class Stretch:
             if given := [pair for pair in seeded if pair[1] is not None]:
                 torch._foreach_copy_(*map(list, zip(*given)))
             penalised = any(seed is not None for seed in other_seeds[len(reaction) :])
-            self.adjoint(work, acting, not tape, penalised)
+            self.adjoint(work, acting, not states, penalised)
             of_acting = self.adjoint_of(work, acting)
             given = (t for t in of_acting if t is not None)
             found = iter(copies([*(part[0] for part in slots), *given, *of_poses]))

@@ -12,6 +12,7 @@ from torch import Tensor
 from mosa.errors import SimulationDiverged
 from mosa.physics.contact.driven import Held
 from mosa.physics.engine.budget import substep_bytes
+from mosa.physics.engine.buffers import Pool
 from mosa.physics.engine.numerics import Numerics, State
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
@@ -66,18 +67,23 @@ class SegmentSolver:
         return len(self.gravities)
 
     def workspace(
-        self, pool: dict[tuple, Workspace], substeps: int, adapted: bool, plastic_adapted: bool,
+        self, pool: Pool, substeps: int, adapted: bool, plastic_adapted: bool,
         with_adjoint: bool, shared: bool = False,
     ) -> Workspace:  # fmt: skip
         """Of a pool that is this thread's alone (`Buffers.take`)."""
         n = len(self.volume)
         key = n, substeps, adapted, plastic_adapted, with_adjoint, self.worlds, shared
-        if key not in pool:
-            pool[key] = Workspace(
+        if not pool.get(key):
+            work = Workspace(
                 self.numerics, n, substeps, adapted=adapted, plastic_adapted=plastic_adapted,
                 with_adjoint=with_adjoint, worlds=self.worlds, shared=shared,
             )  # fmt: skip
-        return pool[key]
+            work.key = key
+            if work.stays:  # those of other lengths, of which there are many, would wait for a rollout that may never come
+                for other, idle in pool.items():
+                    pool[other] = [each for each in idle if not each.stays]
+            pool[key] = [work]
+        return pool[key][-1]
 
     @contextmanager
     def one_look(self, state: State, time: float, margin: int) -> Iterator[None]:
@@ -157,13 +163,21 @@ class SegmentSolver:
         """Whether the states of so many substeps may be kept."""
         return substeps * substep_bytes(self.numerics, len(self.volume)) <= self.room
 
-    def keep(self, tape: list[Tensor]) -> list[Tensor]:
-        """The tape where there is room for it, else []: windows of more nodes than `substep_bytes` knows of."""
-        size = sum(t.nbytes for t in tape)
-        if size > self.room:
+    def keep(self, work: Workspace, pool: Pool) -> list[Tensor] | Workspace:
+        """The states that a forward pass left, where there is room for them: its tape, or the workspace itself, which leaves the
+        pool. Else []: windows of more nodes than `substep_bytes` knows of."""
+        if work.kept_bytes > self.room:
             return []
-        self.room -= size
-        return tape
+        self.room -= work.kept_bytes
+        if not work.stays:
+            return work.tape()
+        pool[work.key].remove(work)
+        return work
+
+    def take_back(self, work: Workspace, pool: Pool) -> None:
+        """A workspace that `keep` let go, for a backward pass and for the next stretch."""
+        self.room += work.kept_bytes
+        pool.setdefault(work.key, []).append(work)
 
     def bounds(self, state: State) -> np.ndarray:
         """`extent` (W, 12) of every world's x and v, without a transfer where `look` has told it."""

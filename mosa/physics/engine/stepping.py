@@ -113,7 +113,8 @@ class Prepared:
         """Memory for the states of `substeps` substeps, where a gradient is `wanted` or an adapter may want one."""
         if wanted or (self.adapter is not None and torch.is_grad_enabled()):
             each = substep_bytes(self.numerics, len(self.packed))
-            self.lanes.give(room(self.numerics.device, substeps * each, self.lanes.worlds))
+            idle = sum(work.kept_bytes for work in self.lanes.buffers if work.stays)
+            self.lanes.give(room(self.numerics.device, substeps * each, self.lanes.worlds, idle))
 
     def begin(
         self, state: State, poses: tuple[Tensor, ...], substeps: int, variable: bool,

@@ -41,8 +41,9 @@ IDLE = 8
 """Times the window's nodes that stay (`window.SMALL` in any case) for when it grows again: idle ones cost memory and, on CUDA,
 threads that end at once."""
 LARGE = 2**22
-"""Bytes of one number of all particles at all kept substeps, from which each tensor of them is copied by itself: one launch for
-many has 320 blocks, which the 132 multiprocessors of an H200 share unevenly."""
+"""Bytes of one number of all particles at all kept substeps, from which copies of the states take longer than the launches that
+they save: where they are kept, the workspace itself is, see `SegmentSolver.keep`; and each tensor of them is copied by itself, as
+one launch for many has 320 blocks, which the 132 multiprocessors of an H200 share unevenly."""
 
 
 class Workspace:
@@ -50,7 +51,11 @@ class Workspace:
 
     worlds: among which the particles are shared in equal parts, one world's after the other's; adapted, plastic_adapted: whether a
     stress operator and a plastic operator act; shared: the stress operator is the same for all particles, with gradients by
-    particle; with_adjoint: also buffers for the adjoint; pointed: no buffers for the operators, which only `point` gives."""
+    particle; with_adjoint: also buffers for the adjoint; pointed: no buffers for the operators, which only `point` gives.
+
+    key: under which it is in a pool."""
+
+    key: tuple = ()
 
     @torch.inference_mode(False)
     def __init__(
@@ -59,14 +64,14 @@ class Workspace:
     ) -> None:  # fmt: skip
         self.worlds, self.size = worlds, particles // worlds
         self.numerics, self.particles, self.substeps = numerics, particles, substeps
-        self.with_adjoint = with_adjoint
+        self.with_adjoint, self._pointed = with_adjoint, pointed
         self.scalar, self.exact = SCALARS[numerics.dtype], needed(numerics.device)
         on_gpu = torch.device(numerics.device).type == "cuda"
         self.each = 2 if on_gpu and not self.exact and particles > FEW else 1
         self.kernels = transfer_kernels(self.scalar, self.exact, self.each)
         self.update = update_kernels(self.scalar)
         self.stress, self.mapping = kernels_of(
-            numerics.law, self.scalar, adapted, plastic_adapted, numerics.energetic
+            numerics.law, self.scalar, adapted, plastic_adapted, numerics.energetic, self.exact
         )
         self.plastic = numerics.law.plastic
         _, self.block_wp = self.array((LANES, 3, 3), wp.mat33d, torch.float64)
@@ -182,6 +187,18 @@ class Workspace:
         # the deformation gradient that is never mapped is F itself where the law does not yield
         whole = arrays if self.plastic else (*arrays, arrays[-1])
         return list(tensors), [filled(self.kernels.Particles, *parts) for parts in zip(*whole)]
+
+    @property
+    def stays(self) -> bool:
+        """Whether the states that its forward pass leaves wait for the backward pass here, and not in copies. A workspace that is
+        pointed to operators has graphs that others hold."""
+        return self._large and self.with_adjoint and not self._pointed
+
+    @property
+    def kept_bytes(self) -> int:
+        """Of what the adjoint reads of a forward pass, in the window that is set."""
+        of_nodes = 2 * self.substeps * 4 * self.nodes * self.numerics.dtype.itemsize
+        return of_nodes + sum(t.nbytes for t in self._particle_slots())
 
     def tape(self) -> list[Tensor]:
         """Copies of all that the adjoint reads of a forward pass, one tensor of slots each, the grid's last."""

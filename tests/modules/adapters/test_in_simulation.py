@@ -6,7 +6,9 @@ import pytest
 import torch
 from drawn_adapters import drawn_adapter, randomise
 
+from mosa.errors import ConfigError
 from mosa.modules.adapters.stress import StressAdapter
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
@@ -130,3 +132,19 @@ def test_one_evaluation_of_a_steady_adapter_is_as_good_as_many(dtype):
     assert scale > 0 and all(
         (r[2] - results[0][2]).abs().max() <= 100 * torch.finfo(dtype).eps * scale for r in results
     )
+
+
+def test_a_steady_adapter_that_reads_the_state_is_refused():
+    """It would be asked but once, and of no state."""
+
+    class Reads(torch.nn.Module):
+        steady = True
+
+        def forward(self, state) -> AdapterOperator:
+            return AdapterOperator(state.w.new_zeros(len(state.w), 6, 6), 0.1 * state.stress)
+
+    adapter = Reads()
+    with pytest.raises(ConfigError, match=r"output h: .* Reads says that it is steady"):
+        roll(adapter, torch.float64, 2, stride=None)
+    adapter.steady = False
+    roll(adapter, torch.float64, 2)

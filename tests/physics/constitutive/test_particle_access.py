@@ -7,7 +7,12 @@ import torch
 import warp as wp
 
 from mosa.physics.constitutive.laws import SLOTS, law_named
-from mosa.physics.constitutive.material_kernels import field_types, state_kernel, stress_kernel
+from mosa.physics.constitutive.material_kernels import (
+    ROWS,
+    field_types,
+    state_kernel,
+    stress_kernel,
+)
 from mosa.physics.constitutive.particle_access import LANES, particle_access
 from mosa.physics.launching import aligned, warp_stream
 
@@ -187,3 +192,49 @@ def test_the_adjoints_wait_for_no_sum(make, tmp_path, monkeypatch):
     assert not re.search(r"\batom\.", backward[0])
     if make is stress_kernel:
         assert len(re.findall(r"red\.relaxed\.gpu\.global\.add\.v4\.f32", backward[0])) >= 9
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+@pytest.mark.parametrize("apart", [False, True])
+def test_rows_of_a_shared_operators_gradient_hold_all_of_it(apart, device):
+    """Of more particles than there are rows: those of one row add up, and with `apart` each has its own."""
+    n, law, (mat33, vec6, mat66, vecp) = ROWS + 3, law_named("corotated"), field_types(wp.float64)
+    kernel = stress_kernel(law.stress, law.uses_rotation, wp.float64, True, apart=apart)
+    g = torch.Generator().manual_seed(0)
+
+    def drawn(*shape):
+        return torch.randn(*shape, generator=g, dtype=torch.float64).to(device)
+
+    F, seed = (
+        torch.eye(3, dtype=torch.float64, device=device) + 0.05 * drawn(n, 3, 3),
+        drawn(n, 3, 3),
+    )
+    zeros = torch.zeros_like
+    inputs = [F, zeros(F), torch.ones(n, SLOTS).to(F), drawn(1, 6, 6), drawn(1, 6), zeros(F)]
+    kinds, found = (mat33, mat33, vecp, mat66, vec6, mat33), []
+    for shared in (True, False):
+        own = [
+            t if shared or len(t) > 1 else t.expand(n, *t.shape[1:]).contiguous() for t in inputs
+        ]
+        adjoints = [
+            zeros(F),
+            zeros(F),
+            zeros(inputs[2]),
+            F.new_zeros(n, 6, 6),
+            F.new_zeros(n, 6),
+            seed.clone(),
+        ]
+        arrays = [
+            [wp.from_torch(t, dtype=kind) for t, kind in zip(each, kinds)]
+            for each in (own, adjoints)
+        ]
+        with warp_stream(F.device):
+            wp.launch(
+                kernel, n, inputs=[*arrays[0], None], adj_inputs=[*arrays[1], None], adjoint=True, device=device
+            )  # fmt: skip
+        wp.synchronize_device(device)
+        found.append(adjoints[3:5])
+    for rows, each in zip(*found):
+        if not apart:
+            each = torch.cat([each[:3] + each[ROWS:], each[3:ROWS], zeros(each[:3])])
+        assert (rows - each).abs().max() <= 1e-12 * each.abs().max() and each[-4].abs().max() > 0

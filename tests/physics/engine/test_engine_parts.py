@@ -3,6 +3,7 @@
 import ast
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -72,12 +73,19 @@ def test_there_are_never_many_more_graphs_than_allowed(most):
     assert len(graphs) > 1
 
 
-def test_room_for_states_is_spent():
+@pytest.mark.parametrize("stays", [False, True])
+def test_room_for_states_is_spent(stays):
     solver = SegmentSolver.__new__(SegmentSolver)
-    solver.room, tape = 0.0, [torch.zeros(10), torch.zeros(30)]  # 160 bytes
-    assert solver.keep(tape) == []
+    solver.room, tape = 0.0, [torch.zeros(10), torch.zeros(30)]
+    work = SimpleNamespace(kept_bytes=160, stays=stays, key=(1,), tape=lambda: tape)
+    pool = {(1,): [work]}
+    assert solver.keep(work, pool) == [] and pool == {(1,): [work]}
     solver.room = 200.0
-    assert solver.keep(tape) is tape and solver.room == 40 and solver.keep(tape) == []
+    assert solver.keep(work, pool) is (work if stays else tape) and solver.room == 40
+    assert pool == {(1,): [] if stays else [work]} and solver.keep(work, pool) == []
+    if stays:
+        solver.take_back(work, pool)
+        assert solver.room == 200 and pool == {(1,): [work]}
 
 
 def test_velocities_lie_between_the_positions_of_steps_that_vary():
