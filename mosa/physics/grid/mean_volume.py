@@ -19,7 +19,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from mosa.physics.grid.node_access import exact_node_access, node_access
+from mosa.physics.grid.node_access import Together, exact_node_access, node_access
 from mosa.physics.grid.stencil import stencil_functions
 
 SPREAD = 1.5
@@ -144,7 +144,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
         return part
 
     @wp.func
-    def spread(field: added_to, at: wp.vec3i, f: vec3, q: vec3, together: wp.vec3i):
+    def spread(field: added_to, at: wp.vec3i, f: vec3, q: vec3, together: Together):
         none = vec3(zero, zero, zero)
         for i in range(2):
             for j in range(2):
@@ -163,7 +163,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
             return
         V = volume[p]
         q = vec3(V * scalar(own_ratio(wp.mat33d(F[p])) - _ONE), V, zero)
-        spread(nodes, at, hats(x[p], grids.inv_dx), q, run(at[0], True))
+        spread(nodes, at, hats(x[p], grids.inv_dx), q, run(at[0], True, 8))
 
     @wp.kernel(module=module, enable_backward=False)
     def average(
@@ -222,7 +222,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
                 more[moduli[1]] = more[moduli[1]] + of_bulk
                 more[mu] = more[mu] + two_thirds * of_bulk
             adj_parameters[p] = more
-        spread(adj_nodes, at, f, vec3(of_mean, zero, zero), run(at[0], True))
+        spread(adj_nodes, at, f, vec3(of_mean, zero, zero), run(at[0], True, 8))
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_collect(

@@ -6,6 +6,8 @@ CPU these are plain accesses. Arrays must be contiguous, and begin where `launch
 
 Sums in memory are what bounds the transfers of a GPU, and neighbouring threads mostly have neighbouring particles: those in a row
 that have the same nodes (`run`) add up their terms in registers, in twos, fours and eights, and the first of them adds to memory.
+Where the next such thread's nodes begin one farther along z, as in a line of a lattice, it takes over the terms of the two nodes
+that both have: of three nodes in a row only the last thread of such a line adds more than one.
 
 A particle's vector of 12 bytes or matrix of 36 lies across the 16 that a thread can store at once, and nine stores of a warp to
 every 36th byte cost nine times the transactions: a warp puts its particles' numbers in shared memory and stores all of them from
@@ -19,6 +21,9 @@ import warp as wp
 
 from mosa.physics.exact_sums import sum_functions
 from mosa.physics.memory_sums import added
+
+Together = wp.types.vector(length=5, dtype=int)
+"""What `run` tells a thread of those around it."""
 
 
 def _either(cuda: str, cpu: str) -> str:
@@ -42,7 +47,9 @@ STORE = {
     pairs[1] = make_double2(z, w);""",
 }
 
-# x: index of the lowest node, -1: takes no part; -> (threads here, place in the run of those with the same x, how many come after)
+# x: index of the lowest node, -1: takes no part; groups: threads that add up, a power of two; -> (threads here, place in the run of
+# those with the same x, how many come after; of the first of a group: the first of the one before, if that has x - 1, else -1, and
+# whether no group after it takes over its terms)
 RUN = """
     const unsigned mask = __activemask(), lane = threadIdx.x & 31;
     const int before = __shfl_up_sync(mask, x, 1);
@@ -51,7 +58,16 @@ RUN = """
     const unsigned upto = (2u << lane) - 1, later = starts & ~upto;
     const int end = later ? __ffs(later) - 1 : 32;
     const int own = lane, place = own - 31 + __clz(starts & upto);
-    return {static_cast<int>(mask), x == -1 ? -1 : place, end - 1 - own};"""
+    const bool adds = x != -1 && place % groups == 0;
+    const unsigned adding = __ballot_sync(mask, adds), earlier = adding & upto >> 1, next = adding & ~upto;
+    const int last = earlier ? 31 - __clz(earlier) : own, there = __shfl_sync(mask, x, last);
+    const bool follows = adds && earlier && there == x - 1;
+    const unsigned following = __ballot_sync(mask, follows);
+    const bool taken = next && following >> (__ffs(next) - 1) & 1;
+    wp::vec_t<5, int> told;
+    told.c[0] = mask, told.c[1] = x == -1 ? -1 : place, told.c[2] = end - 1 - own;
+    told.c[3] = follows ? last : -1, told.c[4] = adds && !taken;
+    return told;"""
 # of two particles, at x and y: (same nodes; the first one adds to memory by itself; the first one of the next thread is added here)
 MEETING = """
     const unsigned mask = __activemask(), lane = threadIdx.x & 31;
@@ -96,9 +112,18 @@ SHARED = """
                 if (both) values[n].c[k] += more;
             }
     }
-    const int adds = place >= 0 && (place & ((1 << STEPS) - 1)) == 0;
+    const int before = together.c[3], source = before < 0 ? threadIdx.x & 31 : before;
+#pragma unroll
+    for (int n = 1; n >= 0; --n)
+#pragma unroll
+        for (int k = 0; k < NUMBERS; ++k) {
+            const auto more = __shfl_sync(mask, values[n + 1].c[k], source);
+            if (before >= 0) values[n].c[k] += more;
+        }
+    const int first_adds = place >= 0 && (place & ((1 << STEPS) - 1)) == 0;
 #pragma unroll
     for (int n = 0; n < 3; ++n) {
+        const int adds = n == 0 ? first_adds : together.c[4];
         const auto x = values[n].c[0], y = values[n].c[1], z = values[n].c[2], w = FOURTH;
         const size_t address = __cvta_generic_to_global(field.data + i + n);ADD
     }"""
@@ -182,12 +207,12 @@ def node_access(scalar) -> SimpleNamespace:
     wp.float64, take3, take33, put3, put33 on those of particles' vectors and matrices.
 
     load(field, i), for memory that nothing in the same launch writes; store(field, i, value), for memory that nothing in the same
-    launch reads; clear(field, i); add(field, i, a, b, c, together), to i, i + 1 and i + 2, for the same, together = run(x, True) of
-    a number x that tells to which i a thread adds, one after the other, -1 where to none. The functions on 3-vectors leave the
+    launch reads; clear(field, i); add(field, i, a, b, c, together), to i, i + 1 and i + 2, for the same, together = run(x, True, 8)
+    of a number x that tells to which i a thread adds, one after the other, -1 where to none. The functions on 3-vectors leave the
     fourth number out; a store sets it to 0. take(field, i) as load; put(field, i, value) stores for the thread's own number i, in
     blocks of whole warps.
     Of two particles a thread, on a GPU, where no thread may leave before: add4_of_two(field, first, i, a, b, c, d, e, f,
-    meeting(x, y), run(y, x == y)), a, b and c to `first` and the two after it, d, e and f to `i`.
+    meeting(x, y), run(y, x == y, 4)), a, b and c to `first` and the two after it, d, e and f to `i`.
     Where `on_cpu()`: scatter adds what a particle sends (`Sent`) to its 27 nodes, of which `i` is the lowest; gather gives the rows
     v, cx, cy, cz of `g2p`, of theirs."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
@@ -221,8 +246,8 @@ def node_access(scalar) -> SimpleNamespace:
     @wp.func_native(own(PUT, "field.data[i] = value;", 9))
     def put33(field: field33, i: int, value: mat33): ...
 
-    @wp.func_native(_either(RUN, "return {0, 0, 0};"))
-    def run(x: int, joins: bool) -> wp.vec3i: ...
+    @wp.func_native(_either(RUN, "return {};"))
+    def run(x: int, joins: bool, groups: int) -> Together: ...
 
     @wp.func_native(_either(MEETING, "return {0, 0, 0};"))
     def meeting(x: int, y: int) -> wp.vec3i: ...
@@ -247,15 +272,15 @@ def node_access(scalar) -> SimpleNamespace:
     def store3(field: field4, i: int, value: vec3): ...
 
     @wp.func_native(add_row(ONLY, 4, 3))
-    def add4(field: field4, i: int, a: vec4, b: vec4, c: vec4, together: wp.vec3i): ...
+    def add4(field: field4, i: int, a: vec4, b: vec4, c: vec4, together: Together): ...
 
     @wp.func_native(add_row(ONLY, 3, 3))
-    def add3(field: field4, i: int, a: vec3, b: vec3, c: vec3, together: wp.vec3i): ...
+    def add3(field: field4, i: int, a: vec3, b: vec3, c: vec3, together: Together): ...
 
     @wp.func_native(add_row(FIRST, 4, 2, cpu=""))
     def add4_of_two(
         field: field4, first: int, i: int, a: vec4, b: vec4, c: vec4, d: vec4, e: vec4, f: vec4,
-        meeting: wp.vec3i, together: wp.vec3i,
+        meeting: wp.vec3i, together: Together,
     ): ...  # fmt: skip
 
     @wp.func_native(_either("return false;", "return true;"))
@@ -301,15 +326,15 @@ def exact_node_access(scalar) -> SimpleNamespace:
     add_exactly, total, clear = functions.add_exactly, functions.total, functions.clear
 
     @wp.func
-    def run(x: int, joins: bool):
-        return wp.vec3i(0, 0, 0)
+    def run(x: int, joins: bool, groups: int):
+        return Together()
 
     def add(numbers: int):
         vector = vec4 if numbers == 4 else vec3
 
         @wp.func
         def add_row(
-            sums: wp.array2d(dtype=wp.int64), node: int, a: vector, b: vector, c: vector, together: wp.vec3i
+            sums: wp.array2d(dtype=wp.int64), node: int, a: vector, b: vector, c: vector, together: Together
         ):  # fmt: skip
             for k in range(numbers):
                 add_exactly(sums, 4 * node + k, a[k])

@@ -186,7 +186,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
             s = sent(own, p, now, grids, dt, check_J, substep, flags)
             r = sent(other, p + 1, now, grids, dt, check_J, substep, flags)
             who = meeting(s.n, r.n)
-            together = run(r.n, s.n == r.n)
+            together = run(r.n, s.n == r.n, 4)
             for i in range(3):
                 for j in range(3):
                     a, b, c = row_of(s, i, j)
@@ -202,7 +202,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
                 if on_cpu():
                     scatter(grid, s.n, s.dims, s.wx, s.wy, s.wz, s.q0, s.bx, s.by, s.bz, s.m)
                     return
-            together = run(s.n, True)
+            together = run(s.n, True, 8)
             for i in range(3):
                 for j in range(3):
                     a, b, c = row_of(s, i, j)
@@ -297,7 +297,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
         dims = grids.windows[place + 1]
         if n < 0:
             return
-        together = run(n, True)
+        together = run(n, True, 8)
         f = xp * grids.inv_dx - base
         wx = spline(f[0])
         wy = spline(f[1])

@@ -28,7 +28,7 @@ def kernel_of(dtype):
         memory.store3(stored3, i, memory.load3(source, i))
         if index[i] < 0:
             return
-        together = memory.run(index[i], True)
+        together = memory.run(index[i], True, 8)
         a = memory.load4(source, i)
         b = memory.load3(source, i)
         memory.add4(added4, index[i], a, scalar(2.0) * a, scalar(3.0) * a, together)
@@ -40,13 +40,17 @@ def kernel_of(dtype):
 @pytest.mark.parametrize("device", ["cpu", GPU])
 @pytest.mark.parametrize("dtype", KINDS)
 @pytest.mark.parametrize("longest", [1, 2, 5, 100])
-def test_loads_stores_and_sums_are_those_of_plain_indexing(longest, dtype, device):
+@pytest.mark.parametrize("rises", [0.0, 0.9])
+def test_loads_stores_and_sums_are_those_of_plain_indexing(rises, longest, dtype, device):
     """Whole numbers, so that sums are exact in any order; some 16 threads meet at each target, in runs of up to `longest`, over the
-    ends of warps and blocks too. Some threads take no part."""
+    ends of warps and blocks too; the next run's target is one more with the chance `rises`. Some threads take no part."""
     n, g = 1000, torch.Generator().manual_seed(0)
     source = torch.randint(-99, 99, (n, 4), generator=g).to(device=device, dtype=dtype)
     lengths = torch.randint(1, longest + 1, (n,), generator=g)
-    index = torch.randint(0, 60, (n,), generator=g).repeat_interleave(lengths)[:n].to(device=device)
+    steps = torch.where(
+        torch.rand(n, generator=g) < rises, 1, torch.randint(0, 60, (n,), generator=g)
+    )
+    index = (steps.cumsum(0) % 60).repeat_interleave(lengths)[:n].to(device=device)
     index[torch.randint(0, n, (50,), generator=g).to(device)] = -1
     results = [torch.full((count, 4), 7.0, device=device, dtype=dtype) for count in (n, n, 62, 62)]
     vec4 = KINDS[dtype][1]
