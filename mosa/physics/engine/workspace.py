@@ -191,8 +191,8 @@ class Workspace:
     @property
     def stays(self) -> bool:
         """Whether the states that its forward pass leaves wait for the backward pass here, and not in copies. A workspace that is
-        pointed to operators has graphs that others hold."""
-        return self._large and self.with_adjoint and not self._pointed
+        pointed to operators has graphs that others hold; on a CPU, where copies cost little, each thread would gather its own."""
+        return self._large and self.with_adjoint and not self._pointed and self.flags.is_cuda
 
     @property
     def kept_bytes(self) -> int:
