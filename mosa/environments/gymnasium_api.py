@@ -58,15 +58,11 @@ class _Worlds:
         seen = spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)
         return seen, spaces.Box(-1.0, 1.0, (len(task.actions),), np.float32)
 
-    def _draw(
-        self, random: np.random.Generator, record: bool, options: dict | None = None
-    ) -> np.ndarray:
-        """Observations of new trials. Errors: ConfigError for options, which would change nothing."""
+    def _draw(self, random: np.random.Generator, record: bool, options: Any = None) -> np.ndarray:
+        """Errors: ConfigError for options of a reset, which would change nothing."""
         if options:
-            raise ConfigError(
-                f"options: expected none, as trials are drawn from the seed, found {', '.join(map(str, options))}: those of a "
-                "task are an argument of the environment"
-            )
+            said = "expected none, as trials are drawn from the seed (a task's are given to the environment)"
+            raise ConfigError(f"options: {said}, found {', '.join(options)}")
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
         task = self.arena.task
         return _array(self.arena.reset(task.draw(self.arena.count, generator), record=record))
