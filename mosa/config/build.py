@@ -120,7 +120,7 @@ def measured(
 def build_body(record: BodyRecord, tensors: Mapping[str, Tensor]) -> Body:
     """A body with the law, adapter and settings of a run. tensors: rest, volume, colors, opacities, covariances."""
     sections = record.sections
-    torch.manual_seed(sections.seed)
+    torch.default_generator.manual_seed(sections.seed)  # all modules are made on the CPU
     material, options = build_prior(sections.prior, record.law)
     heterogeneity = build_heterogeneity(
         sections.heterogeneity, tensors["rest"].amin(0), tensors["rest"].amax(0)

@@ -58,7 +58,11 @@ class _Worlds:
         seen = spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)
         return seen, spaces.Box(-1.0, 1.0, (len(task.actions),), np.float32)
 
-    def _draw(self, random: np.random.Generator, record: bool) -> np.ndarray:
+    def _draw(self, random: np.random.Generator, record: bool, options: Any = None) -> np.ndarray:
+        """Errors: ConfigError for options of a reset, which would change nothing."""
+        if options:
+            said = "expected none, as trials are drawn from the seed (a task's are given to the environment)"
+            raise ConfigError(f"options: {said}, found {', '.join(options)}")
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
         task = self.arena.task
         return _array(self.arena.reset(task.draw(self.arena.count, generator), record=record))
@@ -102,7 +106,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
         self, *, seed: Seed | None = None, options: dict | None = None
     ) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
-        return self._draw(self.np_random, self.render_mode is not None)[0], {}
+        return self._draw(self.np_random, self.render_mode is not None, options)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         if self.arena.trials is not None and self.arena.last:
@@ -162,7 +166,7 @@ class TwinVectorEnv(VectorEnv, _Worlds):
     ) -> tuple[np.ndarray, dict]:
         if seed is not None:
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)
-        return self._draw(self.np_random, False), {}
+        return self._draw(self.np_random, False, options), {}
 
     def step(
         self, actions: np.ndarray

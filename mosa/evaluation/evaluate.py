@@ -159,7 +159,7 @@ def image_metrics(
         return {}
     x0, y0, width, height = boxes
     kinds = {"psnr": metrics.psnr, "ssim": metrics.ssim}
-    kinds |= {own: metric.function for own, metric in metrics.IMAGE_METRICS.items()}
+    kinds |= {own: partial(metric.of, own) for own, metric in metrics.IMAGE_METRICS.items()}
     found: dict[str, list[float]] = {
         f"{kind}_{name}": [] for name in ("crop", "full") for kind in kinds
     }
@@ -201,7 +201,7 @@ def motion_metrics(
         target = true_motion(body, sequence.scene) if target is None else target
         result = {"rms_m": metrics.rms(x[after], target[after])}
         own = metrics.MOTION_METRICS.items()
-        result |= {name: metric.function(x[after], target[after]) for name, metric in own}
+        result |= {name: metric.of(name, x[after], target[after]) for name, metric in own}
         pairs = [(x[t], truth.positions[t]) for t in after]
     chamfer = partial(metrics.chamfer_distances, samples=settings.samples)
     each = list(threaded(lambda pair: chamfer(*pair), pairs))

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
 from mosa.errors import ConfigError
+from mosa.settings import shown
 from mosa.types import MarkerCues, MotionCues
 
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
@@ -34,6 +35,15 @@ class Metric(NamedTuple):
     label: str
     scale: float = 1.0
     digits: int = 3
+
+    def of(self, name: str, found: Tensor, real: Tensor) -> float:
+        """The figure, also of a function that gives a tensor or a number of NumPy. Errors: ConfigError for anything else."""
+        value = self.function(found, real)
+        try:
+            return float(value)
+        except (TypeError, ValueError, RuntimeError) as error:
+            said = f"expected one number of its function, found {shown(value)}"
+            raise ConfigError(f"metric {name!r}: {said}") from error
 
 
 MOTION_METRICS: dict[str, Metric] = {}  # registered, by the figure's name

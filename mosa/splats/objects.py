@@ -140,6 +140,7 @@ def fill_object(
     return tensors, Appearance(splats, appearance.harmonics[kept]), cell
 
 
+@torch.random.fork_rng(devices=[])  # `build_body` seeds the generator, which is the caller's
 def object_twin(
     appearance: Appearance, settings: SplatsSettings, learned: Twin | None = None, most: int = FEW
 ) -> Twin:

@@ -98,6 +98,8 @@ class Twin(InMotion):
         return self._record
 
     @classmethod
+    @torch.inference_mode(False)  # what is loaded may be used with gradients later
+    @torch.random.fork_rng(devices=[])  # `build_body` seeds the generator, which is the caller's
     def load(cls, path: str | Path, device: str = "cpu") -> Twin:
         """Read a checkpoint, as data alone (docs/safety.md). Errors: DataError naming file and part where it is missing, damaged,
         or was not written by this program; ConfigError for a device that is not here."""

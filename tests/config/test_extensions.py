@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -102,6 +103,19 @@ def test_a_name_is_taken_once(monkeypatch):
             register_metric(name, Metric(mine, "mine"))
 
 
+def test_a_metric_may_give_a_tensor_or_a_number_of_numpy(monkeypatch):
+    """They ended a run in a traceback of json, after the fit."""
+    x, y = torch.full((4, 5, 3), 3.0), torch.ones(4, 5, 3)
+    for mean in (lambda a, b: (a - b).mean(), lambda a, b: np.mean((a - b).numpy())):
+        value = Metric(mean, "mine").of("mine", x, y)
+        assert type(value) is float and value == 2.0
+    for wrong in (lambda a, b: a - b, lambda *_: None, lambda *_: "good"):
+        with pytest.raises(
+            ConfigError, match=r"^metric 'mine': expected one number of its functio"
+        ):
+            Metric(wrong, "mine").of("mine", x, y)
+
+
 def test_an_adapter_brings_its_penalties(monkeypatch):
     class Costly(DirectAdapter):
         penalties = {**PENALTIES, "cost": lambda found, misfit: found.mean_abs_C + misfit}
@@ -120,7 +134,7 @@ def test_an_adapter_brings_its_penalties(monkeypatch):
         "cost": 2.5,
     }
     assert terms.evaluate_terms({"cost": 1.0}, SimpleNamespace(operator=None)) == {}
-    for wrong in 3.0, torch.ones(2):
+    for wrong in 3.0, np.float64(3.0), torch.ones(2):
         monkeypatch.setitem(Costly.penalties, "cost", lambda *_: wrong)  # noqa: B023
         with pytest.raises(ConfigError, match=r"losses\.cost: expected a tensor of shape"):
             terms.evaluate_terms({"cost": 1.0}, step)

@@ -60,6 +60,16 @@ def test_the_same_seed_is_the_same_episode(name):
     assert not np.array_equal(*follow)
 
 
+def test_options_of_a_reset_are_refused_as_they_would_change_nothing():
+    for env in (
+        TwinEnv("placement", options=options("placement")),
+        TwinVectorEnv("placement", 2, options=options("placement")),
+    ):
+        env.reset(options={})
+        with pytest.raises(ConfigError, match=r"^options: expected none, .* found height$"):
+            env.reset(options={"height": 0.3})
+
+
 def test_what_is_drawn_is_what_is_seen_or_held():
     env = TwinEnv("placement", options=options("placement"), render_mode="rgb_array", size=40)
     env.reset(seed=0)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from small_bodies import FRAME_DT, NU, STICKY, E, small_body, start
+from strangers import checkpoint
 
 from mosa.errors import ConfigError
 from mosa.modules.adapters.microplane import isotropic_stiffness
@@ -233,3 +234,26 @@ def test_a_checkpoint_keeps_what_was_set(tmp_path):
         assert (found.body.adapter is None) == (made.body.adapter is None)
         expected = made.simulate(height=0.02, frames=4)
         assert torch.allclose(found.simulate(height=0.02, frames=4).x, expected.x, atol=1e-6)
+
+
+def test_a_twin_is_loaded_without_a_trace_in_the_callers_random_numbers(tmp_path):
+    """They were those of the run's seed: the same after each load."""
+    path = checkpoint(tmp_path / "last.ckpt")
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    Twin.load(path)
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_a_twin_that_is_loaded_in_inference_mode_has_gradients_later(tmp_path):
+    path = checkpoint(tmp_path / "last.ckpt")
+    with torch.inference_mode():
+        loaded = Twin.load(path)
+    velocity = torch.zeros(3, requires_grad=True)
+    loaded.reset(velocity=velocity, differentiable=True)
+    state, _ = loaded.step()
+    (slope,) = torch.autograd.grad(state.positions.sum(), velocity)
+    assert bool((slope > 0).all())
+    loaded.material.E = 2 * E
+    assert loaded.material.E == pytest.approx(2 * E)

@@ -14,6 +14,7 @@ from torch import Tensor
 from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
 from mosa.modules.body.material import FORMS, Form, Material
 from mosa.physics.adapters.interface import MaterialState
+from mosa.physics.constitutive.damping import DAMPED
 from mosa.physics.constitutive.laws import SLOTS, law_named
 from mosa.physics.constitutive.material_kernels import field_types, kernels_of
 from mosa.physics.engine.simulator import Simulator
@@ -144,6 +145,7 @@ PROPERTIES = {
     "symmetry": "a symmetric Kirchhoff stress: a skew part is a torque from nothing",
     "objectivity": "tau(Q F) = Q tau(F) Q^T of every rotation Q: a turned body has the turned stress (F F^T in place of F^T F?)",
     "gradient": "an adjoint that is the derivative of the stress: see Warp's notes on differentiable functions",
+    "residual": "no stress at rest, where F = I: a body of it would not keep its shape",
     "rest": "a stiffness at rest that resists every strain: a wrong sign?",
     "loops": "a stress that is the derivative of an energy: closed loops of deformation make work",
 }
@@ -152,16 +154,17 @@ PROPERTIES = {
 @typed
 def check_law(law: Text, parameters: Section) -> dict[str, float]:
     """Relative errors of a registered law, at 100 drawn deformations: `symmetry`, `objectivity`, `gradient` (adjoint
-    against differences), `rest` (how far below 0 a stiffness at rest is), `loops` (d P/dF against its transpose; these two not of
-    laws that yield or flow). Warns above `WRONG`.
+    against differences), `residual` (stress at rest), `rest` (how far below 0 a stiffness at rest is), `loops` (d P/dF against its
+    transpose; these two not of laws that yield or flow). Warns above `WRONG`.
 
     parameters: as `prior.parameters`. Errors: ConfigError for an unknown law or parameter."""
     return errors_of(in_double(Material(law, parameters)))
 
 
 def check_own(material: Material) -> None:
-    """`check_law` of a law that is not this program's, at its start."""
-    if not vars(law_named(material.law).stress)["func"].__module__.startswith("mosa."):
+    """`check_law` of a law that is not this program's, at its start, also where it is damped."""
+    stress = law_named(material.law.removesuffix(DAMPED)).stress
+    if not vars(stress)["func"].__module__.startswith("mosa."):
         errors_of(in_double(copy.deepcopy(material)))
 
 
@@ -175,14 +178,16 @@ def errors_of(material: Material) -> dict[str, float]:
     if law.reference is None:
         Q = deformations(100, 1, 0.0)
         parts["objectivity"] = kirchhoff(material, None, Q @ F), Q @ tau @ Q.mT
-    if not law.plastic and law.viscosity is None and law.reference is None:
+    if law.elastic and law.reference is None:
         inverse = torch.linalg.inv(F)  # P = tau F^-T
         dP = torch.einsum("nimkl,njm->nijkl", slope, inverse)
         dP = dP - torch.einsum("nil,njk->nijkl", tau @ inverse.mT, inverse)
         parts["loops"] = dP, dP.permute(0, 3, 4, 1, 2)
     found = {k: float((a - b).abs().max() / b.abs().max()) for k, (a, b) in parts.items()}
+    rest = torch.eye(3, dtype=F.dtype)[None]
+    found["residual"] = float(kirchhoff(material, None, rest).abs().max() / tau.abs().max())
     if "loops" in parts:
-        C = tangent(material, None, torch.eye(3, dtype=F.dtype)[None])[0]
+        C = tangent(material, None, rest)[0]
         C = (C + C.transpose(2, 3)).reshape(9, 9)  # symmetric strains
         stiffness = torch.linalg.eigvalsh(C + C.T)  # three are 0, of rotations
         found["rest"] = float((-stiffness[0] / stiffness.abs().max()).clamp_min(0))

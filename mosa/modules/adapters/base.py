@@ -163,7 +163,8 @@ class Adapter(nn.Module):
     def statistics(self) -> OperatorStatistics:
         """Of the last evaluation, with its graph. Errors: ConfigError before the first, unless it is `steady`."""
         if self._last is None:
-            raise ConfigError("adapter: statistics are of the last evaluation, and there was none")
+            said = "`forward` to call `note` or `note_stress`, from which statistics are made, found none"
+            raise ConfigError(f"adapter: expected an evaluation, and its {said}")
         if isinstance(self._last, Tensor):
             return statistics_of(self._last)
         return statistics(*self._last)

@@ -142,7 +142,7 @@ def evaluate_terms(weights: Mapping[str, float], step: Step) -> dict[str, Tensor
         counted = [name for name in known if weights.get(name, 0.0) != 0]
         found |= {name: known[name](step.operator, step.misfit) for name in counted}
     for name, value in found.items():
-        if value is not None and getattr(value, "shape", None) != ():
+        if value is not None and not (isinstance(value, Tensor) and value.shape == ()):
             raise ConfigError(
                 f"losses.{name}: expected a tensor of shape () of its term, found {shown(value)}"
             )

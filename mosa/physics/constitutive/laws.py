@@ -4,8 +4,11 @@ Elastic laws are in `elasticity`, yielding ones in `plasticity`, those that flow
 in one grid in `mixture`; the package imports these, and they register themselves. Another module adds its own with `register_law`.
 """
 
+import ast
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import warp as wp
@@ -127,10 +130,11 @@ def register_law(
 
     Example: a fibre family a (rest direction), tau = mu (F F^T - I) + lam log(J) I + 2 kf (I4 - 1) (F a)(F a)^T, takes
     `parameters={"mu": 1, "lam": 1, "kf": 1, "a": 3}` and reads `wp.vec3d(p[3], p[4], p[5])`.
-    Errors: ConfigError if `name` is taken by another law."""
+    Errors: ConfigError if `name` is taken by another law, or if the stress reads what it is not registered with."""
     if not isinstance(parameters, dict):
         parameters = dict.fromkeys(parameters, 1)
     law = Law(name, stress, dict(parameters), **options)
+    check_reads(law)
     known = _LAWS.get(name)
     if known is not None and known != law:
         raise ConfigError(
@@ -138,6 +142,38 @@ def register_law(
         )
     _LAWS[name] = law
     return law
+
+
+def reads(function: wp.Function, place: int) -> bool:
+    """Whether a wp.func reads its argument at this place, or hands it on to one that does."""
+    source, nodes = vars(function)["func"], list(ast.walk(function.adj.tree))
+    name, scope = list(inspect.signature(source).parameters)[place], inspect.getclosurevars(source)
+    known = {**scope.globals, **scope.nonlocals}
+
+    def named(node: ast.AST) -> Any:
+        if isinstance(node, ast.Attribute):
+            return getattr(named(node.value), node.attr, None)
+        return known.get(node.id) if isinstance(node, ast.Name) else None
+
+    loaded = [n for n in nodes if isinstance(n, ast.Name) and n.id == name and isinstance(n.ctx, ast.Load)]  # fmt: skip
+    calls = [(named(n.func), n.args) for n in nodes if isinstance(n, ast.Call)]
+    handed = [(to, k) for to, given in calls if getattr(to, "adj", None) is not None
+              for k, each in enumerate(given) if each in loaded]  # fmt: skip
+    return len(loaded) > len(handed) or any(reads(*each) for each in handed)
+
+
+def check_reads(law: Law) -> None:
+    """A law says what its stress reads: R is F otherwise, and no time step allows for a viscosity. Errors: ConfigError."""
+    if not isinstance(law.stress, wp.Function):
+        raise ConfigError(f"law {law.name!r}: expected a wp.func of its stress, found {law.stress}")
+    told = law.uses_rotation, law.viscosity is not None or law.plastic
+    keys = "uses_rotation=True", "viscosity, a function of its parameters"
+    for place, known, key in zip((1, 2), told, keys):
+        if not known and reads(law.stress, place):
+            argument = "R" if place == 1 else "C_affine"
+            raise ConfigError(
+                f"law {law.name!r}: expected register_law with {key}, as its stress reads {argument}, found none"
+            )
 
 
 def law_named(name: str) -> Law:

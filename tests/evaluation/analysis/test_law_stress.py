@@ -64,7 +64,7 @@ def test_a_right_law_passes(law, more):
         warnings.simplefilter("error")
         found = mosa.check_law(law, SOLID | more)
         check_own(Material(law, SOLID | more))
-    assert set(found) == {"symmetry", "objectivity", "gradient", "rest", "loops"}
+    assert set(found) == {"symmetry", "objectivity", "gradient", "residual", "rest", "loops"}
 
 
 @wp.func
@@ -81,6 +81,23 @@ def test_a_law_whose_rest_is_unstable_is_found():
     mu, lam = 1e5 / 2.6, 3e4 / 1.3 / 0.4
     assert found["rest"] == pytest.approx(2 * mu / max(2 * mu, abs(3 * lam - 2 * mu)))
     assert all(error < 1e-8 for key, error in found.items() if key != "rest")
+
+
+@wp.func
+def stressed_at_rest(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
+    """mu b + lam log(J) I, an energy whose body shrinks: - mu I was left out."""
+    one = wp.identity(n=3, dtype=wp.float64)
+    return p[0] * F * wp.transpose(F) + p[1] * wp.log(wp.determinant(F)) * one
+
+
+def test_a_law_that_is_stressed_at_rest_is_found_also_where_it_is_damped():
+    register_law("checked_stressed", stressed_at_rest, ("mu", "lam"), needs_positive_J=True)
+    with pytest.warns(UserWarning, match=r"residual is off by .* no stress at rest, where F = I"):
+        found = mosa.check_law("checked_stressed", SOLID)
+    assert found["residual"] > 0.1
+    assert all(error < 1e-8 for key, error in found.items() if key != "residual")
+    with pytest.warns(UserWarning, match="'checked_stressed~damped': residual is off by"):
+        check_own(Material("checked_stressed", SOLID | {"damping": 1.0}))
 
 
 def test_parameters_are_a_section():

@@ -6,7 +6,7 @@ import warp as wp
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.elasticity import neo_hookean
-from mosa.physics.constitutive.laws import LawParameters, law_named, register_law
+from mosa.physics.constitutive.laws import LawParameters, law_named, law_names, register_law
 from mosa.physics.engine.simulator import Simulator
 
 
@@ -88,3 +88,41 @@ def test_registration(law):
         register_law("test_fibre", fibre, ("mu", "lam"))
     with pytest.raises(ConfigError, match="at most 12"):
         register_law("test_large", fibre, {"a": 13})
+
+
+@wp.func
+def turned(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
+    """2 mu (F - R) F^T."""
+    return wp.float64(2.0) * p[0] * (F - R) * wp.transpose(F)
+
+
+@wp.func
+def flowing(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
+    """mu sym(C_affine)."""
+    return p[0] * wp.float64(0.5) * (C_affine + wp.transpose(C_affine))
+
+
+@wp.func
+def handed_on(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
+    return neo_hookean(F, R, C_affine, p) + turned(F, R, C_affine, p)
+
+
+def test_what_a_stress_reads_is_registered_with_it():
+    """R was F without a word, and the corotated law of another package one of a change of volume alone."""
+    names = ("mu", "lam")
+    with pytest.raises(
+        ConfigError, match=r"'t_turned': expected .* uses_rotation=True, .*reads R,"
+    ):
+        register_law("t_turned", turned, names)
+    with pytest.raises(ConfigError, match=r"'t_handed_on': expected .*reads R,"):
+        register_law("t_handed_on", handed_on, names)
+    with pytest.raises(ConfigError, match=r"'t_flowing': expected .* viscosity, .*reads C_affine,"):
+        register_law("t_flowing", flowing, names)
+    with pytest.raises(
+        ConfigError, match=r"'t_plain': expected a wp\.func of its stress, found <f"
+    ):
+        register_law("t_plain", lambda F, R, C_affine, p: F, names)
+    assert not {"t_turned", "t_handed_on", "t_flowing", "t_plain"} & set(law_names())
+    register_law("t_turned", turned, names, uses_rotation=True)
+    register_law("t_flowing", flowing, names, viscosity=lambda mu, lam: mu)
+    assert law_named("t_turned~damped").uses_rotation and law_named("t_turned+t_flowing")

@@ -266,7 +266,7 @@ def test_laws_without_a_shear_modulus_are_refused():
         simulator("newtonian", energetic=True)
     with pytest.raises(ConfigError, match=r"shear modulus mu, found .corotated\+newtonian."):
         simulator("corotated+newtonian", energetic=True)
-    register_law("without shear", law_named(LAW).stress, ("kappa", "lam"))
+    register_law("without shear", law_named(LAW).stress, ("kappa", "lam"), uses_rotation=True)
     with pytest.raises(ConfigError, match="shear modulus mu, found 'without shear'"):
         simulator("without shear", energetic=True)
     assert simulator(LAW, energetic=True).numerics.energetic
