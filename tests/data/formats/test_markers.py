@@ -214,6 +214,16 @@ def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
     path.write_text(f"time,name,x,y,z,x\n{rows}")
     with pytest.raises(DataError, match="each once, found time, name, x, y, z, x"):
         read_markers(path)
+    for text, said in (
+        (
+            "time,name,x,y,z\n0.0,a,1,5,2,5,3,5\n",
+            "8 cells below 5 names in row 1: .* decimal point",
+        ),
+        ("time;name;x;y;z\n0,0;a;1,5;2,5;3,5\n", "one column 'time;name;x;y;z': .* by commas"),
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=said):
+            read_markers(path)
 
 
 def test_a_clock_of_milliseconds_and_a_start_in_motion_are_said(tmp_path):
