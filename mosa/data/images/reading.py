@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Annotated
 
 import cv2
 import numpy as np
 from annotated_types import Gt, Le
-from PIL import Image
+from PIL import ExifTags, Image
 
 from mosa.errors import ConfigError, DataError
 from mosa.settings import Whole, check
@@ -100,6 +101,21 @@ def check_pixels(path: Path) -> None:
     if width * height > MOST_PIXELS:
         most = f"at most {MOST_PIXELS / 1e6:.0f} million pixels"
         raise DataError(f"{path}: expected {most}, found {width}x{height}: scale it down")
+
+
+def warn_of_turned(path: Path) -> None:
+    """A warning where a photograph asks to be shown turned or mirrored: programs that make poses and masks differ in doing so."""
+    with Image.open(path) as picture:
+        # a PNG would be decoded for it once more
+        turned = (
+            1 if picture.format == "PNG" else picture.getexif().get(ExifTags.Base.Orientation, 1)
+        )
+    if turned not in (0, 1):
+        warnings.warn(
+            f"{path}: expected pixels that are stored upright, found EXIF orientation {turned}: they are read as stored, in which "
+            "pose, intrinsics and mask have to agree; otherwise write the pictures upright (mogrify -auto-orient)",
+            stacklevel=4,
+        )
 
 
 def check_amount(pictures: int, width: int, height: int) -> None:
