@@ -235,6 +235,15 @@ def test_a_clock_of_milliseconds_and_a_start_in_motion_are_said(tmp_path):
         released(times, positions[:1] + [0.0, 0.1, 0.0] * times[:, None, None], "here")
 
 
+def test_a_body_and_a_recording_in_millimetres_are_asked_about(tmp_path):
+    """They fit each other, and no ground and no free fall tells their unit: a beam of 120 m was learned."""
+    times, positions = let_go()
+    path = write(tmp_path / "fall.csv", times, "abcd", 1e3 * positions)
+    large = {"type": "box", "size": [1e3 * side for side in BOX["size"]]}
+    with pytest.warns(UserWarning, match="expected metres, found a body of .* in millimetres"):
+        load_scene(format="markers", path=str(path), body=large, density=900.0)
+
+
 @pytest.fixture(scope="module")
 def swinging(tmp_path_factory):
     """A block of known law that hangs from one end, and a recording of three of its points."""
