@@ -37,7 +37,7 @@ def read_image(path: Path) -> np.ndarray:
         raise DataError(
             f"{path}: expected a readable image, found {named(path)} ({error})"
         ) from error
-    kind = pixels.dtype
+    kind = pixels.dtype.newbyteorder("=")  # big-endian in TIFF files of ImageJ
     if kind not in (np.uint8, np.uint16, bool) and not np.issubdtype(kind, np.floating):
         raise DataError(
             f"{path}: expected 8 or 16 bits per channel or floating point, found {kind}"
@@ -52,9 +52,14 @@ def read_image(path: Path) -> np.ndarray:
     if not np.isfinite(pixels).all():
         found = int((~np.isfinite(pixels)).sum())
         raise DataError(f"{path}: expected finite pixels, found {found} that are NaN or infinite")
+    if (brightest := float(pixels.max(initial=0))) > OVER:
+        raise DataError(
+            f"{path}: expected floating point from 0 to 1, found up to {brightest:.4g}: write 8 or 16 bits per channel"
+        )
     return np.clip(pixels, 0, 1)
 
 
+OVER = 2.0  # of floating point: an overshoot of 1 is cut off, 255 is another scale
 FAINT = 0.5
 """Of a matte that has anything in it at least. Labels are numbers from 1 on, of 255; and a pixel belongs to the object from half
 coverage on, so that one which is fainter everywhere would be an empty one in all that looks at outlines."""

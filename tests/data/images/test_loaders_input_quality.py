@@ -59,6 +59,17 @@ def test_sixteen_bits_are_kept(tmp_path, channels):
     assert np.abs(read_image(tmp_path / "deep.png") - deep[..., order] / 65535).max() < 1e-6
 
 
+def test_tiff_files_of_imagej(tmp_path):
+    """16 bits are big-endian there, which were refused; 32 bits count to 255, of which all above 1 was white."""
+    grey = np.linspace(0, 1, 48).reshape(6, 8)
+    found = written(Image.fromarray((65535 * grey).astype(">u2")), tmp_path / "a.tif")
+    assert found[..., 0] == pytest.approx(grey, abs=1e-4)
+    found = written(Image.fromarray(grey.astype("f4")), tmp_path / "b.tif")
+    assert found[..., 0] == pytest.approx(grey)
+    with pytest.raises(DataError, match=r"c.tif: expected floating point from 0 to 1, .* 255"):
+        written(Image.fromarray((255 * grey).astype("f4")), tmp_path / "c.tif")
+
+
 def test_a_photograph_that_asks_to_be_turned_is_said(tmp_path):
     """Upright masks beside pixels that a viewer turns by 180 degrees have the same size: the colours were those of elsewhere."""
     turned, path = Image.Exif(), tmp_path / "a.jpg"
