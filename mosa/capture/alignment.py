@@ -67,8 +67,8 @@ def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.
         if len(moving_frames(track)) < 3:
             raise DataError(
                 f"{phone.video}: expected an object that moves through at least 3 frames, whole and away from the border, found a "
-                f"whole object in {int(track.seen.sum())} of {len(track.times)} frames; look at its plate, and film with more room "
-                "around the fall"
+                f"whole object in {int(track.seen.sum())} of {len(track.times)} frames; look at its plate, or its mask "
+                "(white where the object is), and film with more room around the fall"
             )
     step = max(FINE * min(track.clip.interval for track in tracks), FINEST)
     grid = np.arange(-most, most + step, step)

@@ -102,7 +102,9 @@ def test_a_phone_that_does_not_fit_is_named(made):
 def test_a_phone_that_sees_nothing_is_named(made):
     _, phones, tracks, _ = made
     empty = replace(tracks[1], centres=np.full_like(tracks[1].centres, np.nan))
-    with pytest.raises(DataError, match=r"phone1\.mp4.*whole object in 0 of"):
+    with pytest.raises(
+        DataError, match=r"phone1\.mp4.*whole object in 0 of .* its mask \(white where"
+    ):
         coarse_offsets(phones, [tracks[0], empty, *tracks[2:]], 0.6)
 
 

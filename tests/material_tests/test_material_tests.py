@@ -437,7 +437,7 @@ HEADER = "test,mode,first,second,stress_1,stress_2,sd_1\n"
         (HEADER + "a,uniaxial x,1.1,,1e300,,\n", "stress_1: expected a number, found '1e300'"),
         (HEADER + "a,uniaxial x,1.1,,0,,\n", "expected stresses, found 0"),
         (HEADER + "a,uniaxial x,1.1,,1,,1e-300\n", "sd_1, sd_2: expected a positive number"),
-        (HEADER + "a,uniaxial x,1,1,,1,,,5\n", "a cell for each column, found '5' too much"),
+        (HEADER + "a,uniaxial x,1,1,,1,,,5\n", "found 9 cells below 7 names in row 1"),
         (HEADER.replace("second", "first") + "a,uniaxial x,1,,1,,\n", "expected the columns"),
         (HEADER + "a,uniaxial x,0.1,,1,,\na,uniaxial x,0.2,,2,,\n", "found 2 of 2 .*strains"),
         (HEADER + "a,biaxial xy,1.2,1,-2,-1,\na,biaxial xy,0.8,1,2,1,\n", "found 2 of 2 .*sign"),

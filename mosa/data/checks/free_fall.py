@@ -280,7 +280,8 @@ def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
     )
     cause = "another gravity (scene.gravity), or a film that runs backwards (times negated, frames in descending order)?"
     if scene.ground is not None and float(track.low[0]) < scene.ground.height + 0.3 * track.radius:
-        cause = "a film that begins after contact (start it earlier, scene.frames), or one that runs backwards?"
+        cause = "a film that begins after contact (start it earlier, scene.frames), or one that runs backwards or is upside "
+        cause += "down (scene.up, axes of the poses, flipped pictures)?"
     if beyond and float(energy[last]) > SURE * start:
         raise DataError(f"{found}; {cause}")
     if beyond and float(energy[last]) > SUSPECT * start:

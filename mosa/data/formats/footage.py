@@ -30,6 +30,7 @@ LARGEST = 1e30  # of a number in a file: single precision holds it
 
 # relative jitter of frame times that still counts as a constant frame rate
 TIME_JITTER = 1e-3
+GAP = 1.5  # mean steps between two frames, from which on one between them was left out
 RATE = 0.005  # share by which scene.fps may differ from the file's rate: 59.94 and 60 are one
 
 
@@ -213,13 +214,14 @@ def even_times(times: list[float], frames: list[int], where: str, rounding: floa
 
 
 def warn_of_other_rate(times: list[float], fps: float, where: str) -> None:
-    """A warning where scene.fps takes the place of times in the file that say another rate."""
+    """A warning where scene.fps takes the place of times in the file that say another rate, or that a frame was left out."""
     steps = np.diff(np.asarray(times, dtype=np.float64))
-    middle = float(np.median(steps)) if len(steps) else 0.0
-    if middle > 0 and abs(middle * fps - 1) > RATE:
+    mean = float(steps.mean()) if len(steps) else 0.0  # rounded times have another median
+    if mean > 0 and (abs(mean * fps - 1) > RATE or steps.max() > GAP * mean):
         warnings.warn(
-            f"{where}: scene.fps = {fps:g} takes the place of the file's own times, which say {1 / middle:.5g} frames "
-            "per second: expected the same rate, but for a film in slow motion",
+            f"{where}: scene.fps = {fps:g} takes the place of the file's own times, which say {1 / mean:.5g} frames per second, "
+            f"{steps.min():.4g} to {steps.max():.4g} s apart: expected the same rate, but for a film in slow motion, and no frame "
+            "left out",
             stacklevel=2,
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,6 +32,7 @@ FOUND = {AUTO: released, "swing": swung}  # how scene.start is found
 MOST_FRAMES = 100_000
 MISALIGNED = 0.1  # of the points' extent: a distance (rms) of aligned points that is refused
 LEAST_SPAN, MOST_SPAN = 0.01, 3.0  # distances of tracked points over the body's size
+LARGE = 10.0  # [m] of a body that is asked about: a specimen of 10 mm, and its recording, read in millimetres
 FARTHEST = (
     1e9  # mm from a surface, beyond which it was not measured: outside of the lattice around a mesh
 )
@@ -122,6 +124,12 @@ def load_markers(
         raise ConfigError(
             f"scene.body: expected the body [m] on which the tracked points lie, found one of {across:.3g} m, and points that "
             f"are {span:.3g} m apart: another unit?"
+        )
+    if across > LARGE:
+        warnings.warn(
+            f"scene.body: expected metres, found a body of {across:.3g} m on which the points lie: are both in millimetres? Moduli "
+            "scale with lengths",
+            stacklevel=3,
         )
     for each in driven_from_config(loads, "scene.loads"):
         if each.held or not each.mass:

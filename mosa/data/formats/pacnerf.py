@@ -45,6 +45,7 @@ PUBLISHED = {
     "trophy": {"friction_angle": 40.0},
 }
 """Published parameters by folder name (SI, degrees): compared with at the end, never read by learning, in no config."""
+CAMERAS = 11  # of every published film: one of another number is somebody's own, whatever its folder is called
 
 
 def read_pacnerf(
@@ -149,5 +150,5 @@ def load_pacnerf(
     """Scene of a folder in PAC-NeRF's layout. `world`: the keyword arguments of `scene_from_footage`."""
     footage = read_pacnerf(path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes)
     folder = Path(path).resolve().name
-    known = PUBLISHED.get(folder, {})
+    known = PUBLISHED.get(folder, {}) if len(footage.cameras.names) == CAMERAS else {}
     return scene_from_footage(footage, name=name or folder, known_parameters=known, **world)

@@ -17,13 +17,14 @@ from mosa.data.formats.footage import (
     frame_range,
     matrix,
     read_json,
+    warn_of_other_rate,
     world_to_camera,
 )
 from mosa.data.formats.particles import kept_cloud
 from mosa.data.formats.scene_from_footage import scene_from_footage
 from mosa.data.formats.views import read_views, split_mask
 from mosa.errors import DataError
-from mosa.settings import Positive, check
+from mosa.settings import Positive, check, fits
 from mosa.types import REST, Scene
 
 HAND = "hand"  # name of the masks that are not the body's
@@ -46,7 +47,7 @@ def load_phystwin(
 ) -> Scene:
     """Scene of the folder of a case, with the driven set `controller`.
 
-    fps: of the film, which no file says; reach [m]: the controller's points that are at most so far
+    fps: of the film, which metadata.json may say too; reach [m]: the controller's points that are at most so far
     from the body in the first frame move its particles, the others nothing; body: {shape, scale} as
     of `scene_from_footage`: without a shape it is what the body's points enclose, whose unit is the
     metre; holdout_frames: None for those of split.json's test. `world`: other keyword arguments of
@@ -66,6 +67,8 @@ def load_phystwin(
         lambda camera, picture, pixels: split_mask(picture, pixels, masks[camera] / picture.name),
         "metadata.json", scale=scale, fill=fill_holes)  # fmt: skip
     times, where = [k / fps for k in numbers], str(folder / "metadata.json")
+    if fits(Positive, stated := read_json(folder / "metadata.json").get("fps")):
+        warn_of_other_rate([k / stated for k in numbers], fps, where)
     footage = footage_of(scaled, images, mattes, numbers, times, where)
     given = {} if body is None else dict(body)
     if given.get("shape") is None:

@@ -29,8 +29,18 @@ from mosa.errors import DataError
 from mosa.types import Scene
 
 LONGEST = 1000  # characters of a path: a file system takes 4096 bytes, of names of 255 each
-INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
-EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
+INTRINSICS = (
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "w",
+    "h",
+    "camera_angle_x",
+    "camera_angle_y",
+    *COEFFICIENTS,
+)
+EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 JITTER = 0.01
 """By how much poses of a camera that stands still may differ: radians, and shares of the cameras' distance from their middle. Where
 each image's is solved for itself they differ by about a pixel, 0.002."""
@@ -292,10 +302,13 @@ def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
     if "fl_x" in known:
         focal = known["fl_x"], known.get("fl_y", known["fl_x"])
     elif "camera_angle_x" in known:
-        if not 0 < (angle := known["camera_angle_x"]) < math.pi:
-            wanted = "expected radians between 0 and pi"
-            raise DataError(f"{shot.where}: camera_angle_x: {wanted}, found {angle:g}")
-        focal = (0.5 * width / math.tan(0.5 * angle),) * 2
+        across = {"camera_angle_x": width, "camera_angle_y": height}
+        for key in across:
+            if not 0 < known.get(key, 1) < math.pi:
+                wanted = "expected radians between 0 and pi"
+                raise DataError(f"{shot.where}: {key}: {wanted}, found {known[key]:g}")
+        found = [0.5 * across[key] / math.tan(0.5 * known[key]) for key in across if key in known]
+        focal = found[0], found[-1]
     else:
         wanted = "fl_x (and fl_y) in pixels or camera_angle_x in radians"
         raise DataError(f"{shot.where}: expected {wanted}, found neither")

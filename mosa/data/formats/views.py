@@ -20,6 +20,7 @@ from mosa.data.images.reading import (
     read_image,
     resize,
     scaled_size,
+    warn_of_turned,
 )
 from mosa.errors import DataError
 
@@ -52,6 +53,7 @@ def read_views(
         for frame in frames:
             pixels = read_image(path := file(camera, frame))
             if full is None:
+                warn_of_turned(path)
                 full, first = pixels.shape[1::-1], path.name
                 size = scaled_size(*full, scale)
                 check_amount(len(calibration) * len(frames), *size)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Annotated
 
 import cv2
 import numpy as np
 from annotated_types import Gt, Le
-from PIL import Image
+from PIL import ExifTags, Image
 
 from mosa.errors import ConfigError, DataError
 from mosa.settings import Whole, check
@@ -36,7 +37,7 @@ def read_image(path: Path) -> np.ndarray:
         raise DataError(
             f"{path}: expected a readable image, found {named(path)} ({error})"
         ) from error
-    kind = pixels.dtype
+    kind = pixels.dtype.newbyteorder("=")  # big-endian in TIFF files of ImageJ
     if kind not in (np.uint8, np.uint16, bool) and not np.issubdtype(kind, np.floating):
         raise DataError(
             f"{path}: expected 8 or 16 bits per channel or floating point, found {kind}"
@@ -51,9 +52,14 @@ def read_image(path: Path) -> np.ndarray:
     if not np.isfinite(pixels).all():
         found = int((~np.isfinite(pixels)).sum())
         raise DataError(f"{path}: expected finite pixels, found {found} that are NaN or infinite")
+    if (brightest := float(pixels.max(initial=0))) > OVER:
+        raise DataError(
+            f"{path}: expected floating point from 0 to 1, found up to {brightest:.4g}: write 8 or 16 bits per channel"
+        )
     return np.clip(pixels, 0, 1)
 
 
+OVER = 2.0  # of floating point: an overshoot of 1 is cut off, 255 is another scale
 FAINT = 0.5
 """Of a matte that has anything in it at least. Labels are numbers from 1 on, of 255; and a pixel belongs to the object from half
 coverage on, so that one which is fainter everywhere would be an empty one in all that looks at outlines."""
@@ -100,6 +106,21 @@ def check_pixels(path: Path) -> None:
     if width * height > MOST_PIXELS:
         most = f"at most {MOST_PIXELS / 1e6:.0f} million pixels"
         raise DataError(f"{path}: expected {most}, found {width}x{height}: scale it down")
+
+
+def warn_of_turned(path: Path) -> None:
+    """A warning where a photograph asks to be shown turned or mirrored: programs that make poses and masks differ in doing so."""
+    with Image.open(path) as picture:
+        # a PNG would be decoded for it once more
+        turned = (
+            1 if picture.format == "PNG" else picture.getexif().get(ExifTags.Base.Orientation, 1)
+        )
+    if turned not in (0, 1):
+        warnings.warn(
+            f"{path}: expected pixels that are stored upright, found EXIF orientation {turned}: they are read as stored, in which "
+            "pose, intrinsics and mask have to agree; otherwise write the pictures upright (mogrify -auto-orient)",
+            stacklevel=4,
+        )
 
 
 def check_amount(pictures: int, width: int, height: int) -> None:

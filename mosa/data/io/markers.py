@@ -183,7 +183,7 @@ def _read_csv(path: Path) -> Recording:
                 f"{path}: expected the columns {', '.join(COLUMNS)}, each once, found {found}"
             )
         for number, row in enumerate(table, 1):
-            cells = dict(zip(header, row + [""] * (len(header) - len(row))))
+            cells = dict(zip(header, row))
             key = float(cells["time"]), cells["name"]
             if key in rows:
                 raise DataError(f"{path}, row {number}: {key[1]!r} at {key[0]} s for a second time")

@@ -11,6 +11,7 @@ import torch
 from blocks_film import WORLD, assert_same_footage, clouds_of
 from written_scenes import export_particles, export_transforms
 
+from mosa.data.formats.transforms import read_transforms
 from mosa.data.scene import held_out_sequences, load_scene
 
 
@@ -106,6 +107,46 @@ def test_transforms_without_labels_times_extensions_and_with_a_field_of_view(
             del entry[key]
     file.write_text(json.dumps(document))
     assert_same_footage(transforms(file, fps=24.0), blocks)
+
+
+def test_a_field_of_view_of_each_axis(blocks, transforms_folder):
+    file = transforms_folder / "transforms.json"
+    document, K = json.loads(file.read_text()), blocks.cameras.K[0]
+    document["camera_angle_x"] = 2 * float(torch.atan(0.5 * blocks.cameras.width / K[0, 0]))
+    document["camera_angle_y"] = 2 * float(
+        torch.atan(0.5 * blocks.cameras.height / (1.2 * K[1, 1]))
+    )
+    for entry in document["frames"]:
+        del entry["fl_x"], entry["fl_y"]
+    file.write_text(json.dumps(document))
+    with pytest.warns(UserWarning, match="expected focal lengths of square pixels"):
+        found = transforms(file).cameras.K[0]
+    assert torch.allclose(found.diagonal(), K.diagonal() * torch.tensor([1.0, 1.2, 1.0]))
+
+
+def test_a_frame_rate_beside_rounded_times_and_a_frame_that_was_left_out(
+    blocks, transforms_folder, recwarn
+):
+    """Times of 3 digits (0.042, 0.083) were said to be of another rate, and a missing frame moved all after it unsaid."""
+    file = transforms_folder / "transforms.json"
+    document = json.loads(file.read_text())
+    assert float(blocks.times[1]) == pytest.approx(1 / 24)
+    for entry in document["frames"]:
+        entry["time"] = round(entry["time"], 3)
+    file.write_text(json.dumps(document))
+    assert_same_footage(transforms(file, fps=24.0), blocks)
+    assert not [w for w in recwarn if "scene.fps" in str(w.message)]
+    left = sorted({entry["time"] for entry in document["frames"]})[2]
+    document["frames"] = [entry for entry in document["frames"] if entry["time"] != left]
+    file.write_text(json.dumps(document))
+    with pytest.warns(UserWarning, match="0.042 to 0.083 s apart: expected .* no frame left out"):
+        read_transforms(file, fps=24.0)
+
+
+def test_published_numbers_are_those_of_published_films(pacnerf_folder):
+    """A film of one's own in a folder called torus was compared with the torus of PAC-NeRF."""
+    own = pacnerf_folder.rename(pacnerf_folder.parent / "torus")
+    assert pacnerf(own).known_parameters == {}
 
 
 def test_scaling_halves_images_and_intrinsics(blocks, pacnerf_folder):

@@ -214,6 +214,16 @@ def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
     path.write_text(f"time,name,x,y,z,x\n{rows}")
     with pytest.raises(DataError, match="each once, found time, name, x, y, z, x"):
         read_markers(path)
+    for text, said in (
+        (
+            "time,name,x,y,z\n0.0,a,1,5,2,5,3,5\n",
+            "8 cells below 5 names in row 1: .* decimal point",
+        ),
+        ("time;name;x;y;z\n0,0;a;1,5;2,5;3,5\n", "one column 'time;name;x;y;z': .* by commas"),
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=said):
+            read_markers(path)
 
 
 def test_a_clock_of_milliseconds_and_a_start_in_motion_are_said(tmp_path):
@@ -223,6 +233,15 @@ def test_a_clock_of_milliseconds_and_a_start_in_motion_are_said(tmp_path):
     times = np.arange(300) / 100
     with pytest.raises(DataError, match="expected rest at first, found points moving"):
         released(times, positions[:1] + [0.0, 0.1, 0.0] * times[:, None, None], "here")
+
+
+def test_a_body_and_a_recording_in_millimetres_are_asked_about(tmp_path):
+    """They fit each other, and no ground and no free fall tells their unit: a beam of 120 m was learned."""
+    times, positions = let_go()
+    path = write(tmp_path / "fall.csv", times, "abcd", 1e3 * positions)
+    large = {"type": "box", "size": [1e3 * side for side in BOX["size"]]}
+    with pytest.warns(UserWarning, match="expected metres, found a body of .* in millimetres"):
+        load_scene(format="markers", path=str(path), body=large, density=900.0)
 
 
 @pytest.fixture(scope="module")

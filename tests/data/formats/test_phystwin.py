@@ -51,6 +51,15 @@ def test_round_trip(blocks, points, case):
     assert np.array_equal(cloud[:40], points[0][0].astype(np.float32))
 
 
+def test_another_rate_in_the_file_is_said(case):
+    """The film starts at rest: no free fall tells that all of its speeds are half of the true ones."""
+    file = case / "metadata.json"
+    document = json.loads(file.read_text())
+    file.write_text(json.dumps(document | {"fps": 48}))
+    with pytest.warns(UserWarning, match="scene.fps = 24 takes the place of .* say 48 frames"):
+        read(case)
+
+
 def test_the_hand_drives_the_particles_that_it_is_near(blocks, points, case):
     (entry,) = read(case).driven
     assert entry["name"] == "controller"

@@ -1,5 +1,6 @@
 """Input that is readable but odd: depths and palettes of images, holes in mattes, cameras that disagree, raw footage."""
 
+import warnings
 from dataclasses import replace
 
 import cv2
@@ -8,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 from blocks_film import WORLD, block_scene
-from PIL import Image
+from PIL import ExifTags, Image
 
 from mosa.data.checks.cameras import AGREEMENT, lines_of_sight, misses
 from mosa.data.checks.validation import validate
+from mosa.data.formats.views import read_views
 from mosa.data.images.matting import matte_from_plate
 from mosa.data.images.reading import fill_holes, read_image
 from mosa.data.scene import load_scene
@@ -55,6 +57,35 @@ def test_sixteen_bits_are_kept(tmp_path, channels):
     cv2.imwrite(str(tmp_path / "deep.png"), deep)
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[channels]
     assert np.abs(read_image(tmp_path / "deep.png") - deep[..., order] / 65535).max() < 1e-6
+
+
+def test_tiff_files_of_imagej(tmp_path):
+    """16 bits are big-endian there, which were refused; 32 bits count to 255, of which all above 1 was white."""
+    grey = np.linspace(0, 1, 48).reshape(6, 8)
+    found = written(Image.fromarray((65535 * grey).astype(">u2")), tmp_path / "a.tif")
+    assert found[..., 0] == pytest.approx(grey, abs=1e-4)
+    found = written(Image.fromarray(grey.astype("f4")), tmp_path / "b.tif")
+    assert found[..., 0] == pytest.approx(grey)
+    with pytest.raises(DataError, match=r"c.tif: expected floating point from 0 to 1, .* 255"):
+        written(Image.fromarray((255 * grey).astype("f4")), tmp_path / "c.tif")
+
+
+def test_a_photograph_that_asks_to_be_turned_is_said(tmp_path):
+    """Upright masks beside pixels that a viewer turns by 180 degrees have the same size: the colours were those of elsewhere."""
+    turned, path = Image.Exif(), tmp_path / "a.jpg"
+    turned[ExifTags.Base.Orientation] = 3
+
+    def read():
+        calibration = {"phone": (np.eye(3), np.eye(4))}
+        read_views(calibration, [0, 1], lambda *_: path, lambda c, f, p: (p, p[..., 0]), "list")
+
+    Image.new("RGB", (32, 24)).save(path, exif=turned)
+    with pytest.warns(UserWarning, match="a.jpg: expected pixels .* found EXIF orientation 3"):
+        read()
+    Image.new("RGB", (32, 24)).save(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read()
 
 
 def test_truncated_deep_image_is_refused(tmp_path):

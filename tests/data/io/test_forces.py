@@ -158,7 +158,9 @@ def test_held_back_frames_are_found_among_the_rows_of_forces(kinds, told, record
 
 def test_an_empty_cell_was_not_measured_and_notes_are_passed_over(tmp_path):
     path = tmp_path / "a.csv"
-    path.write_text("# load cell 3\ntime, fz, note\n0.1, 1.5, on\n0.2, , off\n\n0.3, 2.5, on\n")
+    path.write_text(
+        "# load cell 3\ntime, fz, note\n0.1, 1.5, on\n0.2\n# a, b, c, d\n\n0.3, 2.5, on\n"
+    )
     curve = read_forces(path, "clamp")
     assert curve.times.tolist() == [0.1, 0.2, 0.3] and curve.forces[::2, 2].tolist() == [1.5, 2.5]
     assert torch.isnan(curve.forces).sum() == 7
@@ -198,7 +200,8 @@ def test_a_force_of_nothing_is_refused(tmp_path):
         with pytest.raises(ConfigError, match=r"world\.forces: expected a list of sections"):
             forces_from_config(items)
     for text in ("", "time,fx\n0,0\n1,0\n", "time,fx\n0,1e300\n1,1\n", "time,fx\n0,inf\n1,1\n",
-                 "time,fx\n0,off\n1,1\n", "time,fx,fx\n0,1,2\n1,1,2\n", "time,fx\n0\n1,1\n"):  # fmt: skip
+                 "time,fx\n0,off\n1,1\n", "time,fx,fx\n0,1,2\n1,1,2\n", "time;fx\n0;1\n1;1\n",
+                 "time,fx\n0.0,1,5\n1.0,1,7\n"):  # fmt: skip
         (tmp_path / "bad.csv").write_text(text)
         with pytest.raises(DataError, match=r"bad.csv: expected"):
             forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])
