@@ -12,7 +12,7 @@ from mosa.modules.body.body import Start, World
 from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.driven import Driven
-from mosa.physics.engine.inputs import numbers
+from mosa.physics.engine.inputs import numbers, without_gradients
 from mosa.physics.engine.simulator import Substeps
 from mosa.settings import Count, Expected, typed
 from mosa.system.limits import counted
@@ -25,7 +25,6 @@ from mosa.twin.start import (
     check_wants_no_gradients,
     start_in,
     warn_of_creep,
-    without_gradients,
 )
 
 FARTHEST = 100.0

@@ -34,7 +34,7 @@ from mosa.physics.contact.motion import pose_at
 from mosa.physics.contact.overlap import HUGE, check_clear
 from mosa.physics.contact.reference import signed_distance
 from mosa.physics.contact.touch import GRIP
-from mosa.physics.engine.inputs import FASTEST, numbers, vector
+from mosa.physics.engine.inputs import FASTEST, numbers, vector, without_gradients
 from mosa.settings import Expected, Number, Settings, such
 from mosa.system.limits import counted
 from mosa.twin.rollout_file import poses
@@ -84,15 +84,6 @@ def check_wants_no_gradients(**given: Any) -> None:
                 f"{name}: expected a tensor without gradients, found one that requires them: use "
                 "reset(differentiable=True) and step, or tensor.detach()"
             )
-
-
-def without_gradients(name: str, value: Tensor) -> Tensor:
-    """What no motion has gradients with respect to. Errors: ConfigError where they are wanted."""
-    if torch.is_grad_enabled() and value.requires_grad:
-        raise ConfigError(
-            f"{name}: expected no gradients, which do not reach it: pass its detach()"
-        )
-    return value.detach()
 
 
 def asks_for_gradients(value: Any) -> bool:

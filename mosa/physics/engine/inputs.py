@@ -140,6 +140,8 @@ def checked_density(
     packed parameters (N, SLOTS): one look at the host for all. worlds: how many may have their own.
 
     A number stays one: arithmetic, and so every bit, is that of a body of one material. Errors: ConfigError."""
+    if isinstance(density, Tensor):
+        density = without_gradients("density", density)
     if not isinstance(density, Tensor) or density.ndim == 0:
         expected = "a positive number [kg/m^3], or one for each particle as a tensor"
         density = float(numbers("density", density, expected, (), dtype=torch.float64))
@@ -151,7 +153,7 @@ def checked_density(
         if density.shape not in shapes or not dense(density):
             said = " or ".join(map(str, shapes))
             raise ConfigError(f"density: expected a number or shape {said}, found {shown(density)}")
-        density = density.detach().to(volume)
+        density = density.to(volume)
         ends = (*torch.aminmax(volume), *torch.aminmax(density))
     names = [name for name in law.offsets if name in MODULI]
     # columns from the first modulus to the last: a list of them is copied to a CUDA device, which waits for it
@@ -188,6 +190,15 @@ def count_of_worlds(state: ParticleState, together: int | None) -> int:
     return worlds
 
 
+def without_gradients(name: str, value: Tensor) -> Tensor:
+    """What no motion has gradients with respect to. Errors: ConfigError where they are wanted."""
+    if torch.is_grad_enabled() and value.requires_grad:
+        raise ConfigError(
+            f"{name}: expected no gradients, which do not reach it: pass its detach()"
+        )
+    return value.detach()
+
+
 def gravity_of_worlds(
     gravity: Tensor | Sequence | None, worlds: int, common: tuple[float, float, float]
 ) -> tuple[tuple[float, float, float], ...]:
@@ -196,9 +207,7 @@ def gravity_of_worlds(
         return (common,) * worlds
     shape = (worlds, 3)
     gravity = numbers("gravity", gravity, f"finite numbers {shape}", shape, dtype=torch.float64)
-    if gravity.requires_grad and torch.is_grad_enabled():
-        raise ConfigError("gravity: expected no gradients: pass its detach()")
-    return tuple(map(tuple, gravity.tolist()))
+    return tuple(map(tuple, without_gradients("gravity", gravity).tolist()))
 
 
 def motions_of_worlds(

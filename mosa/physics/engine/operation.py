@@ -234,7 +234,8 @@ class _Advance(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *seeds):
-        state, others = State(*ctx.saved_tensors[:STATES]), ctx.saved_tensors[STATES:]
+        saved = ctx.saved_tensors  # once: torch.utils.checkpoint gives them a single time
+        state, others = State(*saved[:STATES]), saved[STATES:]
         found, of_others = ctx.stretch.backward(
             state, others, ctx.kept, seeds[: ctx.own], seeds[ctx.own :]
         )

@@ -344,7 +344,8 @@ class Simulator:
         """What a rollout needs besides its state. Errors: ConfigError."""
         every, each = (asked.frames or 1, *state.x.shape[:-1]), 4 * (3 + 3 + 9 + 9)
         counted("particles of all frames", every, "take fewer", each=each)
-        volume, adapter, stride = asked.volume.detach().contiguous(), asked.adapter, asked.stride
+        volume = inputs.without_gradients("volume", asked.volume).contiguous()
+        adapter, stride = asked.adapter, asked.stride
         F = state.F if worlds is None else state.F.flatten(0, 1)
         rotation = inputs.polar_rotation(F) if self.law.reference is not None else None
         packed = self._packed(asked.parameters, len(volume), rotation, worlds)

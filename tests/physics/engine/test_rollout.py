@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import torch.utils.checkpoint
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.adapters.interface import AdapterOperator, MaterialState
@@ -618,6 +619,16 @@ class TestErrors:
         with pytest.raises(ConfigError, match="volume"):
             simulator().rollout(state, self.PARAMETERS, 0 * volume_of(state), DENSITY, 2)
 
+    @pytest.mark.parametrize("name", ["volume", "density"])
+    def test_what_has_no_gradients_asks_for_none(self, name, make_block):
+        state = make_block()
+        given = {"volume": volume_of(state), "density": torch.full((64,), DENSITY).double()}
+        given[name].requires_grad_()
+        with pytest.raises(ConfigError, match=f"{name}: expected no gradients"):
+            simulator().rollout(state, self.PARAMETERS, **given, frames=2)
+        with torch.no_grad():
+            simulator().rollout(state, self.PARAMETERS, **given, frames=2)
+
 
 @pytest.mark.parametrize("kind", ["segments", "chain"])
 def test_a_gradient_can_be_taken_twice(kind, make_block):
@@ -635,6 +646,18 @@ def test_a_gradient_can_be_taken_twice(kind, make_block):
     loss = rollout.x[-1].square().sum()
     first, second = (torch.autograd.grad(loss, mu, retain_graph=True)[0] for _ in range(2))
     assert torch.equal(first, second) and float(first.abs()) > 0
+
+
+def test_a_rollout_under_torchs_checkpoint_has_its_own_gradient(make_block):
+    state, mu = make_block(), torch.full((), 4e4).double().requires_grad_()
+    sim = simulator()
+
+    def end(mu):
+        return sim.rollout(state, {"mu": mu, "lam": 5e4}, volume_of(state), DENSITY, 2).x[-1]
+
+    made = torch.utils.checkpoint.checkpoint(end, mu, use_reentrant=False)
+    again, own = (torch.autograd.grad(x.square().sum(), mu)[0] for x in (made, end(mu)))
+    assert torch.equal(again, own) and float(own.abs()) > 0
 
 
 def test_a_rollout_that_is_dropped_frees_what_it_kept(make_block, monkeypatch):
