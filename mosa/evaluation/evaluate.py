@@ -22,7 +22,7 @@ from mosa.evaluation.analysis.anisotropy import stiffest_axis
 from mosa.evaluation.analysis.stiffness import angle_between, stiffest
 from mosa.evaluation.analysis.vibration import GROWTH_LIMIT, vibration_growth
 from mosa.evaluation.settings import EvaluationSettings
-from mosa.modules.body.body import VARIANTS, Body, Start, World
+from mosa.modules.body.body import Body, Start, World
 from mosa.modules.body.material import material_states
 from mosa.reconstruction.marker_body import cues_of_markers
 from mosa.reconstruction.pose.starts import first_contact
@@ -98,13 +98,13 @@ def run_sequences(
 def rollouts(
     body: Body, sequence: Sequence, world: World
 ) -> tuple[dict[str, Rollout], float | None, float]:
-    """Every variant's rollout over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
+    """The rollout of every variant over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
     particle substeps per second of the last. A variant that cannot be simulated on it is left out, with a warning: on a training
     sequence too, which the fit has simulated near the observed motion, and without its held-out frames."""
     scene = sequence.scene
     sizes: list[float] = []
     result, rate = {}, 0.0
-    for v in VARIANTS:
+    for v in body.variants:
         began, counted = time.perf_counter(), len(sizes)
         try:
             collect = lambda found: sizes.append(float(found.mean_abs_C))  # noqa: E731
@@ -249,7 +249,7 @@ def evaluate(
     for sequence, (simulated, size, _) in zip(sequences, ran):
         if size is not None:
             figures[f"{sequence.prefix}/mean_abs_C"] = size
-        for variant in VARIANTS:
+        for variant in body.variants:
             model = PREFIX[variant]
             if variant in simulated:
                 if world.forces and variant == "adapted":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Ordered
 
 import torch
@@ -12,7 +12,7 @@ from mosa.evaluation.analysis import statements, tables
 from mosa.evaluation.evaluate import SAME, Sequence
 from mosa.modules.body.body import Body
 from mosa.physics.world import World
-from mosa.types import Rollout
+from mosa.types import RUBBING, Rollout
 
 FILE = "model_card.md"
 SHARE = 0.001  # of particles and frames at each end that the range of stretches leaves out
@@ -26,9 +26,12 @@ def filmed(sequences: Ordered[Sequence]) -> list[str]:
         learned = s.learned
         cameras = scene.training_cameras if learned else scene.cameras
         made = "simulated by this program, no capture" if scene.synthetic else "footage"
+        by = f"{len(cameras)} cameras"
+        if scene.markers is not None:
+            made, by = "measured", f"{len(scene.markers.names)} tracked points"
         lines.append(
             f"- `{s.prefix}`, {'learned from' if learned else 'held out'}: scene {scene.name}, "
-            f"sequence {scene.sequence}; {made}; {len(cameras)} cameras, {len(s.frames)} frames at "
+            f"sequence {scene.sequence}; {made}; {by}, {len(s.frames)} frames at "
             f"{1 / dt:.4g} a second; speed at the start {float(s.start.velocity.norm()):.3g} m/s."
         )
     return lines
@@ -61,8 +64,8 @@ def valid(sequences: Ordered[Sequence], kept: Kept, body: Body, world: World) ->
         ]
     if (ground := world.ground) is not None:
         lines.append(
-            f"- The ground at {ground.height:.4g} m was met as `{ground.mode}`, with friction "
-            f"{ground.friction:.3g}. Other surfaces may slide differently."
+            f"- The ground at {ground.height:.4g} m was met as `{ground.mode}`"
+            f"{f', with friction {ground.friction:.3g}' * (ground.mode in RUBBING)}. Other surfaces may slide differently."
         )
     lines += [
         f"- The density {body.density:.5g} kg/m^3 was given, not measured. Without measured forces, "
@@ -94,8 +97,10 @@ def model_card(
     world: World,
     version: str,
     note: str = "",
+    fixed: Collection[str] = (),
 ) -> str:
-    """Markdown. figures: of the run, some may be missing; kept: rollouts by prefix and variant; version: of mosa; note: on all."""
+    """Markdown. figures: of the run, some may be missing; kept: rollouts by prefix and variant; version: of mosa; note: on all;
+    fixed: parameters that were not learned."""
     law, name = body.material.law, sequences[0].scene.name
     # a fit may leave out parts that the body has: their numbers are then 0
     learns = body.adapter is not None and body.adapter.corrects
@@ -107,13 +112,19 @@ def model_card(
         f"Law `{law}`, correction {correction}; the stiffness {field}. The body is "
         f"{1e3 * body.size:.4g} mm long and has {1e6 * float(body.volume.sum()):.4g} cm^3."
     )
+    known = [n for n in fixed if n != "contact_offset_m" and f"id/{n}" in figures]
+    given = ", ".join(f"{tables.with_unit(law, n)} = {figures[f'id/{n}']:.5g}" for n in known)
+    learned += f" Given, not learned: {given}." * bool(given)
     unsure = "This fit keeps no posterior: how sure the law is, is not known."
-    doubt = statements.unexplained_text(figures, world)
-    errors = (note, doubt, tables.results_table(figures), tables.columns_text(figures, name))
+    tracked = sequences[0].scene.markers is not None
+    doubt = statements.unexplained_text(figures, world) or statements.worse_text(figures)
+    about = tables.columns_text(figures, name, tracked)
+    errors = (note, doubt, tables.results_table(figures), about)
     parts = {
         "What was filmed": "\n".join(filmed(sequences)),
-        "What was learned": f"{learned}\n\n{tables.parameter_table(figures, law)}",
-        "What is determined, and what is not": statements.determined_text(figures, law) or unsure,
+        "What was learned": f"{learned}\n\n{tables.parameter_table(figures, law, fixed)}",
+        "What is determined, and what is not": statements.determined_text(figures, law, tracked)
+        or unsure,
         "Errors": "\n\n".join(filter(None, errors)),
         "Where it is valid": "\n".join(valid(sequences, kept, body, world)),
         "Licence": LICENCE,

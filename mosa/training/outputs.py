@@ -160,15 +160,17 @@ def write_outputs(
             "the learned law does not explain the motion: see the first lines of results.md",
             stacklevel=1,
         )
-    parts = (note, doubt or worse_text(figures), results_table(figures), columns_text(figures, evaluated[0].scene.name),
-             parameter_table(figures, law, fixed), determined_text(figures, law), force_lines(figures),
-             geometry_lines(figures))  # fmt: skip
+    about = columns_text(figures, evaluated[0].scene.name, bool(marked))
+    parts = (note, doubt or worse_text(figures), results_table(figures), about, parameter_table(figures, law, fixed),
+             determined_text(figures, law, bool(marked)), force_lines(figures), geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
     with written_whole(folder / "results.md") as partial:
         partial.write_text(table + "\n")
     if (folder / "checkpoints").is_dir():
         with written_whole(folder / "checkpoints" / FILE) as partial:
-            partial.write_text(model_card(figures, body, evaluated, kept, world, __version__, note))
+            partial.write_text(
+                model_card(figures, body, evaluated, kept, world, __version__, note, fixed)
+            )
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
 

@@ -20,6 +20,7 @@ from mosa.evaluation.evaluate import (
     true_motion,
 )
 from mosa.evaluation.settings import EvaluationSettings
+from mosa.modules.body.body import VARIANTS
 from mosa.types import Ground, Truth
 
 
@@ -65,7 +66,7 @@ def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_wor
     """A law that was learned from the first frames may turn an element inside out in the held-out ones."""
     scene = SimpleNamespace(truth=None, holdout_frames=held_frames, holdout_cameras=held_cameras)
     sequences = [Sequence("train", scene, None, 2), Sequence("test/a", scene, None, 2)]
-    body = SimpleNamespace(rest=torch.zeros(1, 3))
+    body = SimpleNamespace(rest=torch.zeros(1, 3), variants=VARIANTS)
     lost = {"train": {"adapted"}, "test/a": {"prior_eta"}}
 
     def rollouts(_, sequence, __):

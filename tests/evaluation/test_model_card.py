@@ -12,7 +12,8 @@ from mosa.evaluation.model_card import model_card, stretches
 
 def sequence(prefix, name):
     scene = SimpleNamespace(name="cube", sequence=name, synthetic=prefix != "train", frame_dt=FRAME_DT,
-                            training_cameras=[0, 1], training_frames=[0, 1, 2, 3], cameras=[0, 1, 2], frames=6)  # fmt: skip
+                            training_cameras=[0, 1], training_frames=[0, 1, 2, 3], cameras=[0, 1, 2], frames=6,
+                            markers=None)  # fmt: skip
     return Sequence(prefix, scene, start(), 2)
 
 
@@ -52,6 +53,26 @@ def test_parts_that_a_fit_left_out_are_not_said_to_be_learned():
         body.heterogeneity.coefficients[0] = body.adapter.numbers[3] = 0.3
     said = model_card({"id/stiffness_ratio": 1.4}, body, evaluated, {}, STICKY, "1")
     assert "correction HyperelasticAdapter; the stiffness varies over the body" in said
+
+
+def test_who_reads_the_card_alone_is_told_what_the_run_was_told():
+    """That the prior predicts better; and no number that was given is among those that were learned."""
+    figures = {"id_prior/E": 3.1e4, "id/E": 3e4, "id_prior/nu": 0.31, "id/nu": 0.31,
+               "test/rms_m": 0.0123, "prior/test/rms_m": 0.00987}  # fmt: skip
+    given = small_body(), [sequence("train", "a")], {}, STICKY, "1"
+    said = model_card(figures, *given, fixed=["nu"])
+    assert "worse than its prior** (rms [mm]: 12.30 against 9.87)" in said
+    assert "| E [Pa]" in said and "| nu" not in said and "Given, not learned: nu = 0.31." in said
+    assert "`sticky`. Other surfaces" in said  # a friction says nothing of what sticks
+
+
+def test_a_card_of_tracked_points_speaks_of_points():
+    evaluated = [sequence("train", "a")]
+    evaluated[0].scene.markers = SimpleNamespace(names=("tip", "base"))
+    figures = {"train/rms_m": 0.001, "posterior/draws": 12, "posterior/test/sd_m": 0.004}
+    said = model_card(figures, small_body(), evaluated, {}, STICKY, "1")
+    assert "measured; 2 tracked points, 4 frames" in said and "after contact" not in said
+    assert "distance of tracked points from their measured places after the release" in said
 
 
 def test_an_affine_motion_has_the_stretches_of_its_gradient():

@@ -148,9 +148,9 @@ def _backbones(law: str, compared: Mapping[str, float], gained: Mapping[str, flo
     return said
 
 
-def determined_text(figures: Mapping[str, float], law: str) -> str:
+def determined_text(figures: Mapping[str, float], law: str, tracked: bool = False) -> str:
     """What the data determine and what they do not, in sentences; empty where a run kept no posterior. law: of the prior, which
-    says what its parameters are measured in."""
+    says what its parameters are measured in; tracked: of points in place of films, which are compared from their release on."""
     lines = []
     if compared := _part(figures, "id_prior/compared/"):
         gained = _part(figures, "id_prior/gain/", "")
@@ -180,9 +180,10 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     says = "with a standard deviation of"
     for name in RELATIVE:
         if (sd := figures.get(f"posterior/{name}_relative_sd")) is not None:
-            found = f"{figures[f'id/{name}']:.4g} {unit_of(law, name)}, {says} {sd:.1%}"
+            spread = f"{sd:.1%}" if sd <= HALF else f"{sd:.2g} in its natural logarithm"
+            found = f"{figures[f'id/{name}']:.4g} {unit_of(law, name)}, {says} {spread}"
             if HALF < sd <= LOOSE:
-                found += f" of its logarithm: known to a factor of {math.exp(sd):.2g}"
+                found += f": known to a factor of {math.exp(sd):.2g}"
             lines.append(_number(name, found, sd <= LOOSE))
     if (sd := figures.get("posterior/friction_angle_sd")) is not None:
         found = f"{figures['id/friction_angle']:.3g} degrees, {says} {sd:.2g}"
@@ -227,8 +228,8 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
         sure = figures.get("posterior/test/coverage", math.nan)
         covered = f"; {sure:.0%} of the errors lie within two such deviations, where 95% should"
         lines.append(
-            "- Held-out positions after contact have a predicted standard deviation (not an error) of "
-            f"{sd * 1e3:.1f} mm (rms){'' if math.isnan(sure) else covered}."
+            f"- Held-out positions after {'the release' if tracked else 'contact'} have a predicted standard deviation "
+            f"(not an error) of {sd * 1e3:.1f} mm (rms){'' if math.isnan(sure) else covered}."
         )
     return "\n".join(lines)
 

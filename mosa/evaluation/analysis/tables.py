@@ -21,6 +21,7 @@ UNITS = {
     "psnr_crop": ("PSNR crop", 1, 2),
     "ssim_crop": ("SSIM crop", 1, 4),
 }
+TRACKED = "*rms*: root mean square distance of tracked points from their measured places after the release"
 METRICS = ("rms_m", "cd_m", "psnr_crop", "ssim_crop")
 FIGURES = {
     "rms_m": "*rms*: root mean square distance of particles from their true places after contact",
@@ -46,9 +47,9 @@ def results_table(figures: Mapping[str, float]) -> str:
     return markdown(["figure", "model", *sequences], rows)
 
 
-def columns_text(figures: Mapping[str, float], recording: str) -> str:
+def columns_text(figures: Mapping[str, float], recording: str, tracked: bool = False) -> str:
     """What rows, columns and figures of `results_table` are; empty where nothing of the training sequence was measured.
-    recording: name of the scene that is learned from first, which no column has."""
+    recording: name of the scene that is learned from first, which no column has; tracked: it is of points in place of films."""
     columns = _sequences(figures)
     if "train" not in columns:
         return ""
@@ -65,7 +66,7 @@ def columns_text(figures: Mapping[str, float], recording: str) -> str:
             if any(f"{prefixes[name]}{column}/{metric}" in figures for column in columns for metric in UNITS)]  # fmt: skip
     said = [
         about
-        for metric, about in FIGURES.items()
+        for metric, about in (FIGURES | {"rms_m": TRACKED} if tracked else FIGURES).items()
         if any(key.endswith(f"/{metric}") for key in figures)
     ]
     return f"Rows: {'; '.join(rows)}. Columns: {', '.join(parts)}. Figures: {'; '.join(said)}."

@@ -93,6 +93,11 @@ class Body(nn.Module):
         return self.__dict__ | {"_made": None}
 
     @property
+    def variants(self) -> list[str]:
+        """Those of VARIANTS that are laws of their own: without a heterogeneity, `prior_eta` is the prior once more."""
+        return [v for v in VARIANTS if v != "prior_eta" or self.heterogeneity is not None]
+
+    @property
     def center(self) -> Tensor:
         """(3,) centre of mass of the rest shape [m]."""
         return (self.rest * self.volume[:, None]).sum(0) / self.volume.sum()

@@ -11,7 +11,7 @@ from mosa.evaluation.analysis.statements import determined_text, worse_text
     ("herschel_bulkley", {"id/viscosity": 10.0, "posterior/viscosity_relative_sd": 0.5},
      "- viscosity = 10 Pa s, with a standard deviation of 50.0%."),
     ("neo_hookean~damped", {"id/damping": 38.75, "posterior/damping_relative_sd": 3.863},
-     "- damping is *not* determined (38.75 Pa s, with a standard deviation of 386.3%)."),
+     "- damping is *not* determined (38.75 Pa s, with a standard deviation of 3.9 in its natural logarithm)."),
     ("drucker_prager", {"id/friction_angle": 39.2, "posterior/friction_angle_sd": 4.8},
      "- friction angle = 39.2 degrees, with a standard deviation of 4.8."),
     ("drucker_prager", {"id/friction_angle": 39.2, "posterior/friction_angle_sd": 21.0},
@@ -19,7 +19,7 @@ from mosa.evaluation.analysis.statements import determined_text, worse_text
     ("stvk", {"id/nu": 0.48, "posterior/nu_sd": 0.144}, "- nu is *not* determined (0.480 with a standard deviation of 0.144)."),
     ("stvk", {"id/nu": 0.318, "posterior/nu_sd": 0.047}, "- nu = 0.318 with a standard deviation of 0.047."),
     ("stvk", {"id/E": 1.668e5, "posterior/E_relative_sd": 0.91},
-     "- E = 1.668e+05 Pa, with a standard deviation of 91.0% of its logarithm: known to a factor of 2.5."),
+     "- E = 1.668e+05 Pa, with a standard deviation of 0.91 in its natural logarithm: known to a factor of 2.5."),
     ("corotated", {"posterior/test/sd_m": 8e-3, "posterior/test/coverage": 0.44},
      "- Held-out positions after contact have a predicted standard deviation (not an error) of 8.0 mm (rms); 44% of the errors lie "
      "within two such deviations, where 95% should."),

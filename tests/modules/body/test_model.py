@@ -40,6 +40,12 @@ def test_backbones_have_no_adapter_and_the_calibrated_one_no_stiffness_field():
         body.model("posterior")
 
 
+def test_a_prior_with_eta_is_compared_only_where_there_is_an_eta():
+    """It was a row of the table beside the prior, with the same figures."""
+    assert small_body(modes=True).variants == ["prior", "prior_eta", "adapted"]
+    assert small_body().variants == ["prior", "adapted"]
+
+
 def test_an_adapter_before_its_stage_is_no_part_of_the_model():
     body = small_body(on=False)
     assert body.model().adapter is None
