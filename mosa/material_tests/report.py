@@ -208,7 +208,9 @@ def plot(
 
     scale, across = UNITS[unit], math.ceil(math.sqrt(len(data.names)))
     down = math.ceil(len(data.names) / across)
-    figure, panels = plt.subplots(down, across, figsize=(3.2 * across, 2.7 * down), squeeze=False)
+    size = (3.2 * across, 2.7 * down)
+    figure, panels = plt.subplots(down, across, figsize=size, squeeze=False, layout="constrained")
+    named = {}
     for panel in panels.flat[len(data.names) :]:
         panel.axis("off")
     for (k, c), chosen in curves(data).items():
@@ -227,10 +229,12 @@ def plot(
         panel.set_title(data.names[k], fontsize=9)
         kind = data.kind[data.row[chosen][0]]
         panel.set_xlabel("shear" if kind == "shear" else "stretch", fontsize=8)
-        panel.set_ylabel(f"{'true stress' if fit.true else 'P'} [{unit}]", fontsize=8)
+        panel.set_ylabel(f"{'true' if fit.true else 'nominal'} stress [{unit}]", fontsize=8)
         panel.tick_params(labelsize=7)
-    panels.flat[len(data.names) - 1].legend(fontsize=7)
-    figure.tight_layout()
+        # no panel need have all of them, so that the legend is the figure's
+        named |= {text: handle for handle, text in zip(*panel.get_legend_handles_labels())}
+    place = {"loc": "outside upper center", "ncols": 2 * across, "fontsize": 8}
+    figure.legend(list(named.values()), list(named), **place)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

@@ -5,11 +5,13 @@ import json
 import math
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from forked import call
+from matplotlib import pyplot
 
 from mosa.config.known_numbers import known_numbers
 from mosa.errors import ConfigError, DataError
@@ -21,6 +23,7 @@ from mosa.material_tests.report import (
     doubts,
     figures,
     mean_explained,
+    plot,
     reading,
     rms,
     table,
@@ -481,6 +484,23 @@ def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert math.isnan(mean_explained(data, data.value))
+
+
+def test_the_legend_names_what_any_panel_shows_and_covers_none(tmp_path, monkeypatch):
+    """It was in the last panel, over its points: of a last test of one stress, nothing named the second one of the others."""
+    biaxial = [
+        dict(r, stress_1=1.0, stress_2=2.0) for r in rows("biaxial xy", np.array([1.1, 1.2]))
+    ]
+    uniaxial = [dict(r, test="b", stress_1=1.0) for r in rows("uniaxial x", np.array([1.1, 1.2]))]
+    data = measurements([dict(r, test="a") for r in biaxial] + uniaxial, "Pa", "here")
+    monkeypatch.setattr(pyplot, "close", lambda figure: None)
+    plot(tmp_path / "tests.png", data, SimpleNamespace(predicted=data.value, true=False), {}, "Pa")
+    figure = pyplot.gcf()
+    monkeypatch.undo()
+    (legend,) = figure.legends
+    assert {text.get_text() for text in legend.get_texts()} == {"stress_1", "stress_2", "fitted"}
+    assert not any(panel.get_legend() for panel in figure.axes)
+    pyplot.close(figure)
 
 
 def test_the_command_leaves_a_material_that_a_twin_reads(tmp_path):
