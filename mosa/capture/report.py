@@ -33,7 +33,7 @@ def write_report(
 def page(found: dict[str, Any]) -> str:
     """What was found, in Markdown."""
     fall, said, ground = found["fall"], found["warnings"], found["ground"]
-    sure = lambda value: "given" if value is None else f"{value:.2g}"  # noqa: E731
+    sure = lambda value, unit="": "given" if value is None else f"{value:.2g}{unit}"  # noqa: E731
     unusual = "\n".join(["**To be looked at first:**", "", *(f"- {line}" for line in said)])
     tilt = ground["tilt_degrees"]
     tilted = "" if tilt is None else f"| tilt of the floor's points [degrees] | {tilt:.2f} | |\n"
@@ -58,7 +58,7 @@ Learn from it:
 | | found | one standard deviation |
 |---|---|---|
 | metres per unit of the poses | {found["scale"]:.6g} | {sure(found["scale_sd"])} |
-| up in the poses' world | {up} | {sure(found["up_sd_degrees"])} degrees |
+| up in the poses' world | {up} | {sure(found["up_sd_degrees"], " degrees")} |
 | ground [m], from {ground["from"]} | 0, by definition | {sure(ground["sd"])} |
 {tilted}| radius of the object [m] | {found["radius"]:.3g} | |
 | free fall [s, clock of {first}] | {fall["window"][0]:.3f} to {fall["window"][1]:.3f} | |
