@@ -247,7 +247,13 @@ def ahead(figure: Figure, claim: Claim, rows: Rows) -> str:
     for row, each in known.items():
         notes = [row] + [f"better in {each.better} of {each.of}"] * (each.of > 1)
         notes += [f"without {', '.join(each.without)}"] * bool(each.without)
-        own, other = (cell.text(figure.decimals) for cell in (each.mine, each.other))
+        pair, usual = (each.mine, each.other), figure.decimals
+        # rounding may not hide which of the two is ahead
+        apart = (
+            n for n in range(usual, usual + 3) if len({f"{cell.mean:.{n}f}" for cell in pair}) > 1
+        )
+        decimals = next(apart, usual)
+        own, other = (cell.text(decimals) for cell in pair)
         parts.append(f"{own} against {other} ({'; '.join(notes)})")
     text = f"{word}, {', '.join(parts)}" + f"; {NOT_RUN}: {', '.join(missing)}" * bool(missing)
     return text + "; one seed" * any(each.mine.sd is None for each in known.values())

@@ -55,6 +55,12 @@ def test_a_claim_holds_only_by_more_than_the_spread_of_the_seeds():
         one
         == "holds against those that were run, 10.0 against 20.0 (prior); not run: box; one seed"
     )
+    near = verdict(
+        found,
+        claim,
+        {"rms [mm]": cells(ours=(4.546, None, 1), prior=(4.499, None, 1), box=(9.0, None, 1))},
+    )
+    assert near == "does not hold, 4.55 against 4.50 (prior), 4.5 against 9.0 (box); one seed"
     best = Claim("more is better", "PSNR", row="ours", against=("prior",))
     assert verdict(
         found, best, {"PSNR": cells(ours=(30.0, None, 1), prior=(31.0, None, 1))}
