@@ -371,10 +371,11 @@ def draw(records: list[dict], folder: Path) -> None:
             above.set_ylabel("E between plates [kPa]" if plates else "E [kPa]")
         above.set_ylim(0, 1.05 * above.get_ylim()[1])
         above.set_title(name.replace(TWIN, ", isotropic twin"), fontsize=10)
-        above.legend(fontsize=8, loc="lower left")
         below.set_ylim(0, 1.05 * top)
         below.set_ylabel("w")
         below.set_xlabel("angle from the fibre [degrees]")
+        under = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18), "ncols": 2, "fontsize": 8}
+        below.legend(*above.get_legend_handles_labels(), **under)
     folder.mkdir(parents=True, exist_ok=True)
     stem = folder / "directions_from_motion"
     picture = save(canvas, stem)
