@@ -84,7 +84,7 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     flight = None if values["flight"] is None else tuple(map(float, values["flight"]))
     ground = None if values["ground"] is None else np.array(values["ground"], float)
     most, own = float(values["max_offset"]), None if like is not None else ground
-    fall, phones = found_fall(given, tracks, knowledge, most, flight, own)
+    fall, phones, centred = found_fall(given, tracks, knowledge, most, flight, own)
     span = fall.window
     log.info("fall: %.3f to %.3f s on the clock of %s, %d centres", *span, phones[0].name, fall.frames)  # fmt: skip
     common = common_path(phones, tracks, fall, knowledge)
@@ -119,7 +119,12 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     found |= figures(values, told, free, knowledge, world, times, centres, radius, floor)
     found["warnings"] = warnings_of(found, values, knowledge, phones)
     write_whole(folder / FILE, json.dumps(found, indent=1))
-    write_report(folder, found, phones, fall, exposures, world, times)
+    # the outlines' own centres wander about the body's, and off the parabola
+    seen = [
+        exposure_of(v, *pair, fall, knowledge, common)
+        for v, pair in enumerate(zip(phones, centred))
+    ]
+    write_report(folder, found, phones, fall, seen, world, times)
     for line in found["warnings"]:
         log.warning("warning: %s", line)
     log.info(
@@ -194,9 +199,9 @@ def check_ground(fall: Fall, phones: list[Phone], ground: np.ndarray | None) -> 
 def found_fall(
     phones: list[Phone], tracks: list[Track], knowledge: Knowledge, most: float, flight: tuple[float, float] | None = None,
     ground: np.ndarray | None = None,
-) -> tuple[Fall, list[Phone]]:  # fmt: skip
-    """The fall from nothing but tracks, and the phones turned to where they see it: rough clocks, a parabola, and again with the
-    outlines that the hull has, the impact, and these phones. most [s]: of
+) -> tuple[Fall, list[Phone], list[Track]]:  # fmt: skip
+    """The fall from nothing but tracks, the phones turned to where they see it, and the tracks that it was fitted to: rough clocks,
+    a parabola, and again with the outlines that the hull has, the impact, and these phones. most [s]: of
     offsets; flight: first and last time [s], ground: a point (3,) of the floor, where they are known. Errors: DataError;
     ConfigError, before the corrections, where what is known contradicts the fall."""
     offsets = coarse_offsets(phones, tracks, most)
@@ -204,6 +209,7 @@ def found_fall(
         free_fall(phones, tracks, offsets, knowledge, flight)
     fall = fit_fall(phones, tracks, offsets, knowledge, flight)
     check_ground(fall, phones, ground)
+    fitted = tracks
     for _ in range(CORRECTIONS):
         better = corrected(phones, tracks, fall, knowledge)
         if better is None:
@@ -211,13 +217,13 @@ def found_fall(
                 "warning: the mattes have no common hull in the free fall: check poses, mattes"
             )
             break
-        window = fall.window if flight is None else flight
+        fitted, window = better, fall.window if flight is None else flight
         fall = fit_fall(phones, better, fall.offsets, knowledge, window)
         fall = through_impact(phones, better, fall, knowledge)
         shifts = without_common(phones, fall)
         phones = [shifted(phone, shift) for phone, shift in zip(phones, shifts)]
         fall = replace(fall, shifts=fall.shifts - shifts)
-    return fall, phones
+    return fall, phones, fitted
 
 
 def of_phone(values: Mapping[str, Any], name: str, key: str):

@@ -107,8 +107,8 @@ def draw_contact_sheet(folder: Path, names: list[str], frames: int) -> None:
 def draw_fall(
     file: Path, phones: list[Phone], fall: Fall, exposures: list[Exposure], world: World
 ) -> None:
-    """Heights at which each phone sees the centre, with the parabola; and how far each sees it from
-    there, in pixels, but for a constant."""
+    """Heights at which each phone sees the centre, with the parabola; and how far each sees it from there, in pixels. exposures: of
+    the tracks that the fall was fitted to."""
     figure, (above, below) = plt.subplots(2, 1, figsize=(8, 7), sharex=True, height_ratios=(2, 1))
     first, last = fall.window
     t = np.linspace(first, last, 100)
@@ -127,7 +127,6 @@ def draw_fall(
         line = above.plot(when[inside], heights, ".", ms=4, label=phone.name)[0]
         free = (when >= first) & (when <= last)
         off = exposure.path(when[free]) - fall.shifts[v] - phone.camera.project(fall.at(when[free]))
-        off -= off.mean(0)  # an outline's centre is not the body's
         below.plot(when[free], off[:, 0], "x", ms=3, color=line.get_color())
         below.plot(when[free], off[:, 1], ".", ms=4, color=line.get_color())
     above.set_ylabel("height of the centre [m]")

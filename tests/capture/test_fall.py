@@ -45,7 +45,7 @@ def test_the_fall_says_clocks_scale_and_down(made):
         RELEASE - 1 / 60 < begin < RELEASE + 2.5 / 60
         and CONTACT - 2.5 / 60 < end < CONTACT + 1 / 60
     )
-    better, _ = found_fall(phones, tracks, knowledge, 0.6)
+    better, *_ = found_fall(phones, tracks, knowledge, 0.6)
     true = np.array([film.begin for film in films]) - films[0].begin
     off = better.offsets - true
     assert (
@@ -172,7 +172,7 @@ def test_phones_whose_poses_are_a_little_off_are_turned_to_where_they_see_the_bo
     """By 2 px, which is 3 % of the cone's radius."""
     _, phones, tracks, _ = made
     wrong = np.random.default_rng(0).normal(size=(6, 2)) * 2
-    _, turned = found_fall(
+    _, turned, _ = found_fall(
         [shifted(p, d) for p, d in zip(phones, wrong)], tracks, Knowledge(gravity=G), 0.6
     )
     spot = (R @ [0.0, 0.3, 0.0] / SCALE + WORLD[2])[None]
