@@ -210,7 +210,7 @@ def plot(
     down = math.ceil(len(data.names) / across)
     size = (3.2 * across, 2.7 * down)
     figure, panels = plt.subplots(down, across, figsize=size, squeeze=False, layout="constrained")
-    named = {}
+    named: dict[str, Any] = {}
     for panel in panels.flat[len(data.names) :]:
         panel.axis("off")
     for (k, c), chosen in curves(data).items():
@@ -233,7 +233,7 @@ def plot(
         panel.tick_params(labelsize=7)
         # no panel need have all of them, so that the legend is the figure's
         named |= {text: handle for handle, text in zip(*panel.get_legend_handles_labels())}
-    place = {"loc": "outside upper center", "ncols": 2 * across, "fontsize": 8}
+    place: dict[str, Any] = {"loc": "outside upper center", "ncols": 2 * across, "fontsize": 8}
     figure.legend(list(named.values()), list(named), **place)
     figure.savefig(path, dpi=110)
     plt.close(figure)
