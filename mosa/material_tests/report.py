@@ -51,9 +51,10 @@ def explained(value: np.ndarray, found: np.ndarray) -> float:
     return float(1 - ((found - value) ** 2).sum() / spread) if spread > 0 else math.nan
 
 
-def mean_explained(data: Measurements, found: np.ndarray) -> float:
-    """Mean of R2 over the curves that have one; NaN where none has."""
-    each = [explained(data.value[c], found[c]) for c in curves(data).values()]
+def mean_explained(data: Measurements, found: np.ndarray, test: int | None = None) -> float:
+    """Mean of R2 over the curves (of one test) that have one; NaN where none has."""
+    own = (c for (k, _), c in curves(data).items() if test in (None, k))
+    each = [explained(data.value[c], found[c]) for c in own]
     return float(np.mean([value for value in each if not math.isnan(value)] or [math.nan]))
 
 
@@ -194,7 +195,7 @@ def table(
         chosen = ~data.without(k)
         value, found = data.value[chosen], fit.predicted[chosen]
         out = f"{rms(left_out[name] - value) / scale:.3g}" if name in left_out else ""
-        off, share = rms(found - value) / scale, explained(value, found)
+        off, share = rms(found - value) / scale, mean_explained(data, fit.predicted, k)
         told = "" if math.isnan(share) else f"{share:.3f}"
         lines.append(f"| {name} | {chosen.sum()} | {off:.3g} | {told} | {out} |")
     return "\n".join(lines) + "\n"
@@ -205,6 +206,7 @@ def plot(
 ) -> None:
     """A panel for each test: measured (points, with standard deviations), fitted (line), predicted when left out (dashes)."""
     import matplotlib.pyplot as plt
+    from matplotlib.lines import Line2D
 
     scale, across = UNITS[unit], math.ceil(math.sqrt(len(data.names)))
     down = math.ceil(len(data.names) / across)
@@ -222,10 +224,10 @@ def plot(
         sd = None if np.isnan(data.sd).any() else data.sd[chosen][order] / scale
         look = {"fmt": "o", "ms": 3, "lw": 0.6, "color": color, "label": f"stress_{c + 1}"}
         panel.errorbar(x[order], data.value[chosen][order] / scale, sd, **look)
-        panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color, label="fitted")
+        panel.plot(x[order], fit.predicted[chosen][order] / scale, color=color)
         if data.names[k] in left_out:
             found = left_out[data.names[k]][chosen[own]]
-            panel.plot(x[order], found[order] / scale, "--", color=color, lw=1, label="left out")
+            panel.plot(x[order], found[order] / scale, "--", color=color, lw=1)
         panel.set_title(data.names[k], fontsize=9)
         kind = data.kind[data.row[chosen][0]]
         panel.set_xlabel("shear" if kind == "shear" else "stretch", fontsize=8)
@@ -233,6 +235,9 @@ def plot(
         panel.tick_params(labelsize=7)
         # no panel need have all of them, so that the legend is the figure's
         named |= {text: handle for handle, text in zip(*panel.get_legend_handles_labels())}
+    named["fitted"] = Line2D([], [], color="0.3")
+    if left_out:
+        named["left out"] = Line2D([], [], color="0.3", linestyle="--", lw=1)
     place: dict[str, Any] = {"loc": "outside upper center", "ncols": 2 * across, "fontsize": 8}
     figure.legend(list(named.values()), list(named), **place)
     figure.savefig(path, dpi=110)

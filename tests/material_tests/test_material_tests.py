@@ -21,6 +21,7 @@ from mosa.material_tests.fitting import Fit, Fitting, Law
 from mosa.material_tests.measurements import measurements, read_tests
 from mosa.material_tests.report import (
     doubts,
+    explained,
     figures,
     mean_explained,
     plot,
@@ -501,6 +502,23 @@ def test_the_legend_names_what_any_panel_shows_and_covers_none(tmp_path, monkeyp
     assert {text.get_text() for text in legend.get_texts()} == {"stress_1", "stress_2", "fitted"}
     assert not any(panel.get_legend() for panel in figure.axes)
     pyplot.close(figure)
+
+
+def test_of_one_test_the_row_and_the_whole_have_the_same_R2():
+    """The row took the stresses of both axes as one curve, about one mean."""
+    states = [dict(r, test="a", stress_1=s, stress_2=s / 3)
+              for r, s in zip(rows("biaxial xy", np.array([1.1, 1.2, 1.3])), (1.0, 2.1, 2.9))]  # fmt: skip
+    data = measurements(states, "Pa", "here")
+    away = data.value + np.where(data.component == 0, 0.0, 0.2)
+    whole, row = mean_explained(data, away), mean_explained(data, away, 0)
+    assert whole == row != pytest.approx(explained(data.value, away))
+    law = SimpleNamespace(adapter=None, material=SimpleNamespace(law="any"), unsure=[])
+    fit = SimpleNamespace(predicted=away, names=[], effective=0, noise=1.0, simulated=None, other=None, true=False,
+                          theta=np.zeros(0), covariance=np.zeros((0, 0)))  # fmt: skip
+    (line,) = (
+        each for each in table(law, data, fit, {}, "Pa").splitlines() if each.startswith("| a |")
+    )
+    assert line.split(" | ")[3] == f"{whole:.3f}"
 
 
 def test_the_command_leaves_a_material_that_a_twin_reads(tmp_path):
