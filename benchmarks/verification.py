@@ -79,7 +79,7 @@ def conservation(_):
             )
             ax.axhline(limit, color=color, ls="--", lw=1)
         ax.set_title(f"{name} momentum, relative change, 1000 substeps, adapter on")
-        ax.tick_params(axis="x", rotation=30)
+        ax.tick_params(axis="x", rotation=90)
     axes[0].legend(title="dashed: asked")
     save("conservation", axes)
     checks = {"mass": ("1", "grid mass over 1000 substeps, f32 / f64", "1e-6 / 1e-12"),
@@ -179,7 +179,7 @@ def elastic(_):
     axes[0].plot(tau, y, ".", ms=4, label="mean of tau_yy over two periods")
     line = torch.linspace(0, 0.32, 2)
     axes[0].plot(-DENSITY * 9.8 * (0.32 - line), line, "k-", lw=1, label="-density g (H - y)")
-    axes[0].set(xlabel="Pa", ylabel="height [m]", title="hydrostatic column, 16 cells")
+    axes[0].set(xlabel="tau_yy [Pa]", ylabel="height [m]", title="hydrostatic column, 16 cells")
     axes[0].legend()
     save("column", axes)
     cells = [8, 16, 32, 64]
@@ -194,7 +194,11 @@ def elastic(_):
         lw=0.8,
         label="cos(pi c t/L)",
     )
-    axes[0].set(xlabel="s", title="first standing wave of a free rod")
+    axes[0].set(
+        xlabel="time [s]",
+        ylabel="amplitude over the first",
+        title="first standing wave of a free rod",
+    )
     axes[0].legend()
     for law in SOLIDS:
         axes[1].loglog(cells, errors[law], "o-", ms=3, label=law)
@@ -433,8 +437,8 @@ def bar(data, cells: int = 30):
         rows += [["bar", f"{what}, {n} cells per metre", asked, f"{rms:.4f} m"],
                  ["bar", beside, "-", f"{bars.distance(times, tip, own):.4f} m"]]  # fmt: skip
     axes[1].legend(fontsize=7)
-    axes[0].set(xlabel="s", ylabel="displacement of the corner [m]", title="hanging bar")
-    axes[1].set(xlabel="s", ylabel="m", title="difference to finite elements")
+    axes[0].set(xlabel="time [s]", ylabel="displacement of the corner [m]", title="hanging bar")
+    axes[1].set(xlabel="time [s]", ylabel="difference [m]", title="difference to finite elements")
     axes[0].legend(fontsize=7)
     save("bar", axes)
     return rows
