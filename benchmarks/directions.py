@@ -16,6 +16,7 @@ so that the grid causes no error. `--drops train test_60` learns from several dr
 from __future__ import annotations
 
 import json
+import textwrap
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -352,7 +353,7 @@ def draw(records: list[dict], folder: Path) -> None:
                 f", {r['particles']} particles" if len({s["particles"] for s in same}) > 1 else ""
             )
             label += f", {len(r['drops'])} drops" if len(r["drops"]) > 1 else ""
-            label += f"\n{settings(r)}" if settings(r) else ""
+            label += f"\n{textwrap.fill(settings(r), 30)}" if settings(r) else ""
             if not above.lines:
                 above.plot(
                     degrees,
