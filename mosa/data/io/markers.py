@@ -26,6 +26,8 @@ SEEN = 0.05
 move them by less."""
 EARLY = 0.4
 """Of the largest displacement: up to there it grows as the square of the time since the release."""
+BENT = 0.1
+"""Of the growth of that displacement's root: a distance (rms) from a line beyond which it is none."""
 SWINGS = 4
 """Periods of an oscillation that say when it began."""
 MIRRORED = 1 / 3
@@ -223,7 +225,13 @@ def released(times: np.ndarray, positions: np.ndarray, where: str) -> float:
     early = first + int(np.argmax(moved[first:] > EARLY * largest))
     chosen = np.arange(first, max(early, first + 2))
     chosen = chosen[np.isfinite(moved[chosen])]
-    slope, height = np.polyfit(times[chosen], np.sqrt(moved[chosen]), 1)
+    root = np.sqrt(moved[chosen])
+    slope, height = np.polyfit(times[chosen], root, 1)
+    if np.std(root - slope * times[chosen] - height) > BENT * np.ptp(root):
+        raise DataError(
+            f"{where}: expected points at rest until they are let go, found a slow motion at {times[first]:.3g} s that becomes "
+            "faster later: points that drift, or are moved by hands? Set scene.start [s]"
+        )
     found = times[first] if slope <= 0 else -height / slope
     if found < times[0]:
         raise DataError(f"{where}: expected rest at first, found points moving; set scene.start")
