@@ -201,13 +201,10 @@ class Fitting:
         curve = 2 * self.data.test[self.data.row] + self.data.component
         order = np.argsort(curve, kind="stable")
         pairs = np.stack([misfit[order][:-1], misfit[order][1:]])[:, np.diff(curve[order]) == 0]
-        size = (pairs**2).sum()
-        found = 2 * pairs.prod(0).sum() / size if size > 0 else 0.0
-        if found**2 * pairs.shape[1] < CHANCE**2 or found < 0:
-            return 0.0
-        # at least one residual of each curve counts
-        length = len(misfit) / len(np.unique(curve))
-        return float(min(found, (length - 1) / (length + 1)))
+        found = 2 * pairs.prod(0).sum() / ((pairs**2).sum() + LEAST**2)
+        length = len(misfit) / len(np.unique(curve))  # one residual of each curve counts at least
+        chance = CHANCE > found * np.sqrt(pairs.shape[1])
+        return 0.0 if chance else float(min(found, (length - 1) / (length + 1)))
 
     def scaled(self, theta: np.ndarray) -> np.ndarray:
         """With its moduli scaled to the tests, where they then have the sign of the tests."""

@@ -140,8 +140,8 @@ def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
     elif fit.together > SYSTEMATIC and rms(fit.predicted - data.value) > EXACT * rms(data.value):
         poor = (
             f"tests: neighbouring residuals are alike (correlation {fit.together:.2f}): these curves have an offset, a preload, "
-            "slack or a loop, hold another stress, or the law does not follow them (try another prior). The standard deviations of the "
-            "numbers do not contain such an error"
+            "slack or a loop, hold another stress, or the law does not follow them (try another prior). The standard deviations of "
+            "the numbers do not contain such an error"
         )
     least = CLEAR if strained(data) > WIDE else 1 / CLEAR
     slip = reading(fit) if (fit.other or CLEAR) < least else ""

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from mosa.data.io.tables import read_table
+from mosa.data.io.tables import number, read_table
 from mosa.errors import ConfigError, DataError
 
 COLUMNS = ("time", "name", "x", "y", "z")
@@ -184,12 +184,13 @@ def _read_csv(path: Path) -> Recording:
             raise DataError(
                 f"{path}: expected the columns {', '.join(COLUMNS)}, each once, found {found}"
             )
-        for number, row in enumerate(table, 1):
+        for i, row in enumerate(table, 1):
             cells = dict(zip(header, row))
-            key = float(cells["time"]), cells["name"]
-            if key in rows:
-                raise DataError(f"{path}, row {number}: {key[1]!r} at {key[0]} s for a second time")
-            rows[key] = [float(cells[axis] or "nan") for axis in "xyz"]
+            at = f"{path}, row {i}"
+            time, *place = (number(cells[each], f"{at}: {each}") for each in ("time", *"xyz"))
+            if (key := (time, cells["name"])) in rows:
+                raise DataError(f"{at}: {key[1]!r} at {time} s for a second time")
+            rows[key] = place
     except (OSError, csv.Error, ValueError) as error:
         raise DataError(f"{path}: expected rows of {', '.join(COLUMNS)} ({error})") from error
     times = np.array(sorted({time for time, _ in rows}))

@@ -234,6 +234,14 @@ def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
             "time,name,x,y,z\n0.0,a,1,5,2,5,3,5\n",
             "8 cells below 5 names in row 1: .* decimal point",
         ),
+        (
+            "time,name,x,y,z\n0,a,1,2,3\n0.1,a,1,lost,3\n",
+            "row 2: y: expected a number or an empty cell, found 'lost'",
+        ),
+        (
+            "time,name,x,y,z\n0,a,1,2,3\n0,a,1,2,3\n",
+            "row 2: 'a' at 0.0 s for a second time",
+        ),
         ("time;name;x;y;z\n0,0;a;1,5;2,5;3,5\n", "one column 'time;name;x;y;z': .* by commas"),
     ):
         path.write_text(text)
