@@ -35,7 +35,7 @@ UNKNOWN = 100.0  # standard deviation of an unconstrained number that the tests 
 HOPELESS = 1e3  # residual (rms stresses) where the law has no equilibrium
 UNSURE, ANY = 3.0, math.pi / math.sqrt(12)
 """Standard deviation above which a number is not determined: unconstrained, and of an angle [rad], of lines of any direction."""
-CHANCE = 2.0  # standard deviations below which a correlation of residuals is by chance
+CHANCE = 2.5  # standard deviations below which a correlation of residuals is by chance
 LEAST = 1e-5  # noise, in the unit of the residuals: of a test that a law meets exactly
 SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
 """Standard deviation of the stiffness' numbers at first; how often the evidence looks again; the range in which it is chosen."""
