@@ -35,6 +35,7 @@ UNKNOWN = 100.0  # standard deviation of an unconstrained number that the tests 
 HOPELESS = 1e3  # residual (rms stresses) where the law has no equilibrium
 UNSURE, ANY = 3.0, math.pi / math.sqrt(12)
 """Standard deviation above which a number is not determined: unconstrained, and of an angle [rad], of lines of any direction."""
+CHANCE = 2.5  # standard deviations below which a correlation of residuals is by chance
 LEAST = 1e-5  # noise, in the unit of the residuals: of a test that a law meets exactly
 SIGMA, LOOKS, FEWEST, MOST = 0.5, 8, 1e-3, 3.0
 """Standard deviation of the stiffness' numbers at first; how often the evidence looks again; the range in which it is chosen."""
@@ -45,7 +46,7 @@ class Fit:
     """theta: (k,) numbers by `names`, unconstrained; covariance (k, k); noise: factor on the given standard deviations, or [Pa];
     sigma: of the stiffness' numbers; effective: how many numbers the tests determine; predicted: (m,) [Pa]; simulated: of a fit
     with a pressure, (m,) [Pa] of the same numbers without it, as simulations and exports have them; NaN without an equilibrium;
-    true: whether the stresses are Cauchy's; other: what `Fitting.other_reading` finds."""
+    true: whether the stresses are Cauchy's; other: what `Fitting.other_reading` finds; together: what `Fitting.together` finds."""
 
     names: tuple[str, ...]
     theta: np.ndarray
@@ -57,6 +58,7 @@ class Fit:
     simulated: np.ndarray | None = None
     true: bool = False
     other: float | None = None
+    together: float = 0.0
 
 
 class Law:
@@ -177,6 +179,9 @@ class Fitting:
             best = solve(best.x, 100)
             if max(abs(np.log(np.array(before) / (noise, sigma)))) < 0.02:
                 break
+        together = self.together(misfit)
+        known = J.T @ J / noise**2 * (1 - together) / (1 + together) + prior
+        covariance = np.linalg.inv(known + UNKNOWN**-2 * np.eye(len(prior)))
         effective = float(shares[np.sqrt(np.diag(covariance)) < self.law.unsure].sum())
         scale = noise if not np.isnan(self.data.sd).any() else noise * self.unit
         told = self.law.names, best.x, covariance, scale, sigma, effective, self.predicted(best.x)
@@ -188,7 +193,18 @@ class Fitting:
                 )
             except SimulationDiverged:
                 free = np.full(len(self.data.value), np.nan)
-        return Fit(*told, free, own.true)
+        return Fit(*told, free, own.true, together=together)
+
+    def together(self, misfit: np.ndarray) -> float:
+        """Correlation of neighbouring residuals (m,) along the curves, in the order of the file; 0 where chance explains it. An
+        error of the law or an offset of the file makes them alike: (1 + r)/(1 - r) of them then count as one."""
+        curve = 2 * self.data.test[self.data.row] + self.data.component
+        order = np.argsort(curve, kind="stable")
+        pairs = np.stack([misfit[order][:-1], misfit[order][1:]])[:, np.diff(curve[order]) == 0]
+        found = 2 * pairs.prod(0).sum() / ((pairs**2).sum() + LEAST**2)
+        length = len(misfit) / len(np.unique(curve))  # one residual of each curve counts at least
+        chance = CHANCE > found * np.sqrt(pairs.shape[1])
+        return 0.0 if chance else float(min(found, (length - 1) / (length + 1)))
 
     def scaled(self, theta: np.ndarray) -> np.ndarray:
         """With its moduli scaled to the tests, where they then have the sign of the tests."""

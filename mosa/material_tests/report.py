@@ -25,11 +25,12 @@ from mosa.twin.saved import save_twin
 from mosa.twin.twin import Twin
 
 matplotlib.use("Agg")
-GOOD, CLEAR, WIDE, SAME, SOFTEST, STIFFEST, LONGEST = 0.95, 1.5, 0.4, 1.1, 1e3, 1e10, 15.0
-"""R2 below which a fit is warned of; ratio of errors above which tests prefer one reading of stress, and logarithm of the stretch
-above which others are asked for it; ratio above which exports differ from the fit; E [Pa] below and above which the unit is
-doubted: most gels and tissues have more, and what stretches far has less; and the stretch above which strain is suspected: rubber
-breaks before."""
+GOOD, SYSTEMATIC, CLOSE, CLEAR, WIDE = 0.95, 0.5, 0.03, 1.5, 0.4
+SAME, SOFTEST, STIFFEST, LONGEST = 1.1, 1e3, 1e10, 15.0
+"""R2 below which a fit is warned of, and correlation of neighbouring residuals above which it is, unless they are below that share
+of the stresses (rms); ratio of errors above which tests prefer one reading of stress, and logarithm of the stretch above which
+they are asked for it; ratio above which exports differ from the fit; E [Pa] below and above which the unit is doubted: most gels
+and tissues have more, and what stretches far has less; and the stretch above which strain is suspected: rubber breaks before."""
 SIDE, ACROSS = 0.05, 6
 """Of the cube that a checkpoint holds [m], and its particles along an edge."""
 
@@ -137,7 +138,14 @@ def doubts(law: Law, data: Measurements, fit: Fit, unit: str) -> list[str]:
             "too far away (prior.parameters, starts), or the file holds strain (expected: stretch, 1 at rest) or another "
             f"stress than {READINGS[fit.true]}"
         )
-    slip = reading(fit) if (fit.other or CLEAR) < CLEAR and strained(data) > WIDE else ""
+    elif fit.together > SYSTEMATIC and rms(fit.predicted - data.value) > CLOSE * rms(data.value):
+        poor = (
+            f"tests: neighbouring residuals are alike (correlation {fit.together:.2f}): these curves have an offset, a preload, "
+            "slack or a loop, hold another stress, or the law does not follow them (try another prior). The standard deviations of "
+            "the numbers do not contain such an error"
+        )
+    least = CLEAR if strained(data) > WIDE else 1 / CLEAR
+    slip = reading(fit) if (fit.other or CLEAR) < least else ""
     name = "E" if "E" in law.material.names else "kappa"
     if not SOFTEST < (modulus := float(law.material.reference_modulus())) < STIFFEST:
         others = " or ".join(each for each in UNITS if each != unit)

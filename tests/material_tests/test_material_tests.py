@@ -372,6 +372,36 @@ def test_a_stress_at_rest_is_warned_of():
         assert found in str(said[0].message) if found else not said
 
 
+def test_an_error_that_all_residuals_share_is_no_scatter():
+    """Uniaxial and equibiaxial curves with noise of 1 % from a stretch of 1.1 on, sound; with an offset of the load cell of 10 % of
+    the largest stress; with slack of 5 % of the length; true stress up to 1.4. The spoiled ones have an R2 above 0.95."""
+    l = np.linspace(1.1, 2.4, 12)
+    noise = 1 + 0.01 * np.random.default_rng(3).standard_normal((2, len(l)))
+
+    def fitted(l, read, spoil):
+        states = [*rows("uniaxial x", read), *rows("biaxial xy", read)]
+        P = MU * spoil(l, np.stack([l - l**-2, l - l**-5]) * noise).ravel()
+        data = measurements([dict(r, stress_1=v) for r, v in zip(states, P)], "Pa", "here")
+        law = Law(Material("neo_hookean", {"E": 1e5, "nu": NU}, ["nu"]), None, "full")
+        fitting = Fitting(law, data, True, starts=1, seed=0)
+        fit = replace(fitting.fit(), other=fitting.other_reading())
+        said = "; ".join(doubts(law.set(fit.theta), data, fit, "Pa"))
+        assert "R2" not in said
+        return fit, float(np.sqrt(fit.covariance[0, 0])), said
+
+    _, sound, said = fitted(l, l, lambda _, P: P)
+    assert not said.startswith("tests:") and "stress: read as" not in said
+    for read, spoil in ((l, lambda _, P: P + 0.1 * P.max()), (l + 0.05, lambda _, P: P)):
+        fit, sd, said = fitted(l, read, spoil)
+        assert "an offset, a preload, slack" in said and "do not contain" in said
+        # the residuals of a curve are not independent: its scatter alone would give half of this, and less
+        alone = fit.noise / np.sqrt((fit.predicted**2).sum())
+        assert sd > 2 * alone and sd > 5 * sound
+    l = np.linspace(1.03, 1.4, 12)
+    assert "with stress=cauchy" in fitted(l, l, lambda l, P: l * P)[2]
+    assert "with stress=cauchy" not in fitted(l, l, lambda l, P: P)[2]
+
+
 def test_a_law_of_shear_and_bulk_modulus_is_looked_at_like_others():
     """It has no E: the report asked for one, behind the fit."""
     register_law("of_mu_and_kappa", law_named("stvk").stress, ("mu", "kappa"))

@@ -13,7 +13,7 @@ from warnings import warn
 import torch
 from torch import Tensor
 
-from mosa.data.io.tables import read_table
+from mosa.data.io.tables import number, read_table
 from mosa.errors import ConfigError, DataError
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.world import World
@@ -123,19 +123,25 @@ def read_forces(path: Path, of: str, sd: float | None = None) -> ForceCurve:
         known = [name for name in names if name in COLUMNS]
         if len(set(known)) < max(2, len(known)) or "time" not in known:
             raise ValueError(f"the columns {', '.join(names)}")
-        rows = [row for row in rows if row[0][:1] != "#"]
-        found = {name: [float(row[names.index(name)] or "nan") for row in rows] for name in known}
-    except (OSError, ValueError, IndexError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise DataError(
             f"{path}: expected a csv of {', '.join(COLUMNS)} (SI units), found {error}"
         ) from error
-    blank = [math.nan] * len(rows)
+    kept = {i: row for i, row in enumerate(rows, 1) if row[0][:1] != "#"}
+    found = {}
+    for name in known:
+        at = names.index(name)
+        found[name] = [number(row[at], f"{path}: row {i}: {name}") for i, row in kept.items()]
+    blank = [math.nan] * len(kept)
     times, *columns = (
         torch.tensor(found.get(name, blank), dtype=torch.float64) for name in COLUMNS
     )
     forces = torch.stack(columns, 1)
-    if len(times) < 2 or not bool((times.diff() > 0).all() & times.isfinite().all()):
-        raise DataError(f"{path}: time: expected at least two ascending numbers [s], found others")
+    every = times.tolist()
+    late = [(i, b) for i, a, b in zip(kept, [-math.inf, *every], every) if not a < b < math.inf]
+    if late or len(every) < 2:
+        told = f"{late[0][1]:g} in row {late[0][0]}" if late else f"{len(every)} rows"
+        raise DataError(f"{path}: time: expected at least two ascending numbers [s], found {told}")
     there = forces[~torch.isnan(forces)]
     if not len(there) or not 1 / LARGEST < float(there.abs().max()) <= LARGEST:
         raise DataError(f"{path}: expected forces [N], not all 0, up to {LARGEST:g}, found others")

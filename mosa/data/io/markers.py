@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from mosa.data.io.tables import read_table
+from mosa.data.io.tables import number, read_table
 from mosa.errors import ConfigError, DataError
 
 COLUMNS = ("time", "name", "x", "y", "z")
@@ -26,6 +26,8 @@ SEEN = 0.05
 move them by less."""
 EARLY = 0.4
 """Of the largest displacement: up to there it grows as the square of the time since the release."""
+BENT = 0.1
+"""Of the growth of that displacement's root: a distance (rms) from a line beyond which it is none."""
 SWINGS = 4
 """Periods of an oscillation that say when it began."""
 MIRRORED = 1 / 3
@@ -182,12 +184,13 @@ def _read_csv(path: Path) -> Recording:
             raise DataError(
                 f"{path}: expected the columns {', '.join(COLUMNS)}, each once, found {found}"
             )
-        for number, row in enumerate(table, 1):
+        for i, row in enumerate(table, 1):
             cells = dict(zip(header, row))
-            key = float(cells["time"]), cells["name"]
-            if key in rows:
-                raise DataError(f"{path}, row {number}: {key[1]!r} at {key[0]} s for a second time")
-            rows[key] = [float(cells[axis] or "nan") for axis in "xyz"]
+            at = f"{path}, row {i}"
+            time, *place = (number(cells[each], f"{at}: {each}") for each in ("time", *"xyz"))
+            if (key := (time, cells["name"])) in rows:
+                raise DataError(f"{at}: {key[1]!r} at {time} s for a second time")
+            rows[key] = place
     except (OSError, csv.Error, ValueError) as error:
         raise DataError(f"{path}: expected rows of {', '.join(COLUMNS)} ({error})") from error
     times = np.array(sorted({time for time, _ in rows}))
@@ -223,7 +226,13 @@ def released(times: np.ndarray, positions: np.ndarray, where: str) -> float:
     early = first + int(np.argmax(moved[first:] > EARLY * largest))
     chosen = np.arange(first, max(early, first + 2))
     chosen = chosen[np.isfinite(moved[chosen])]
-    slope, height = np.polyfit(times[chosen], np.sqrt(moved[chosen]), 1)
+    root = np.sqrt(moved[chosen])
+    slope, height = np.polyfit(times[chosen], root, 1)
+    if np.std(root - slope * times[chosen] - height) > BENT * np.ptp(root):
+        raise DataError(
+            f"{where}: expected points at rest until they are let go, found a slow motion at {times[first]:.3g} s that becomes "
+            "faster later: points that drift, or are moved by hands? Set scene.start [s]"
+        )
     found = times[first] if slope <= 0 else -height / slope
     if found < times[0]:
         raise DataError(f"{where}: expected rest at first, found points moving; set scene.start")

@@ -6,6 +6,8 @@ import csv
 from itertools import dropwhile
 from pathlib import Path
 
+from mosa.errors import DataError
+
 
 def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
     """Names of the columns, and a cell for each of them in each row below: a row may leave out its last ones, which are then empty.
@@ -25,3 +27,11 @@ def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
         if any(row[end:]) and row[0][:1] != "#":
             raise csv.Error(f"{len(row)} cells below {end} names in row {number}: {way}")
     return names, [row[:end] + [""] * (end - len(row)) for row in rows]
+
+
+def number(text: str, where: str) -> float:
+    """Of a cell, NaN of an empty one. where: file, row and column. Errors: DataError."""
+    try:
+        return float(text or "nan")
+    except ValueError as error:
+        raise DataError(f"{where}: expected a number or an empty cell, found {text!r}") from error

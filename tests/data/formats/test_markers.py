@@ -80,6 +80,21 @@ def test_the_release_is_found_to_a_part_of_a_sample():
         released(times, positions[::-1], "here")
 
 
+def test_a_drift_before_the_release_is_not_read_as_its_beginning():
+    """A swing of 13 mm at 5.3 Hz, released at 0.5 s from hands that sink by 4 mm/s until then: a line through the root of the
+    displacement ends 0.2 s too early. Without the drift the release is found."""
+    times = np.arange(0, 2.0, 0.01)
+    t = np.clip(times - 0.5, 0, None)
+    swing = 13e-3 * (1 - np.exp(-2 * t) * np.cos(2 * np.pi * 5.3 * t))
+    places = np.array([[0.1, 0.02, 0.0], [0.1, 0.0, 0.02]])
+    found = np.tile(places, (len(times), 1, 1))
+    found[..., 1] -= swing[:, None]
+    assert released(times, found, "here") == pytest.approx(0.5, abs=0.01)
+    found[..., 1] -= 4e-3 * np.minimum(times, 0.5)[:, None]
+    with pytest.raises(DataError, match=r"here: expected points at rest .* Set scene\.start"):
+        released(times, found, "here")
+
+
 def test_a_swing_begins_at_its_turning_point():
     """Of a body that hands let go over 20 ms: the oscillation is that of a release in one moment, and
     of 13 samples a period a resampled one keeps its amplitude."""
@@ -218,6 +233,14 @@ def test_a_table_as_spreadsheets_write_it_is_read(tmp_path):
         (
             "time,name,x,y,z\n0.0,a,1,5,2,5,3,5\n",
             "8 cells below 5 names in row 1: .* decimal point",
+        ),
+        (
+            "time,name,x,y,z\n0,a,1,2,3\n0.1,a,1,lost,3\n",
+            "row 2: y: expected a number or an empty cell, found 'lost'",
+        ),
+        (
+            "time,name,x,y,z\n0,a,1,2,3\n0,a,1,2,3\n",
+            "row 2: 'a' at 0.0 s for a second time",
         ),
         ("time;name;x;y;z\n0,0;a;1,5;2,5;3,5\n", "one column 'time;name;x;y;z': .* by commas"),
     ):

@@ -200,10 +200,18 @@ def test_a_force_of_nothing_is_refused(tmp_path):
         with pytest.raises(ConfigError, match=r"world\.forces: expected a list of sections"):
             forces_from_config(items)
     for text in ("", "time,fx\n0,0\n1,0\n", "time,fx\n0,1e300\n1,1\n", "time,fx\n0,inf\n1,1\n",
-                 "time,fx\n0,off\n1,1\n", "time,fx,fx\n0,1,2\n1,1,2\n", "time;fx\n0;1\n1;1\n",
+                 "time,fx,fx\n0,1,2\n1,1,2\n", "time;fx\n0;1\n1;1\n",
                  "time,fx\n0.0,1,5\n1.0,1,7\n"):  # fmt: skip
         (tmp_path / "bad.csv").write_text(text)
         with pytest.raises(DataError, match=r"bad.csv: expected"):
+            forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])
+    for text, said in (
+        ("0,1\n# a note\n1,n/a\n", "row 3: fx: expected a number or an empty cell, found 'n/a'"),
+        ("0,1\n2,1\n2,1\n", "time: expected at least two ascending numbers .* found 2 in row 3"),
+        ("0,1\n,1\n2,1\n", "time: expected at least two ascending numbers .* found nan in row 2"),
+    ):
+        (tmp_path / "bad.csv").write_text("time,fx\n" + text)
+        with pytest.raises(DataError, match=r"bad\.csv: " + said):
             forces_from_config([{"of": "low", "file": str(tmp_path / "bad.csv")}])
     (tmp_path / "bad.csv").write_text("t,force\n0,1\n1,2\n")
     with pytest.raises(DataError, match=r"bad.csv: .*found the columns t, force"):
