@@ -163,7 +163,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
             return
         V = volume[p]
         q = vec3(V * scalar(own_ratio(wp.mat33d(F[p])) - _ONE), V, zero)
-        spread(nodes, at, hats(x[p], grids.inv_dx), q, run(at[0], True, 8))
+        spread(nodes, at, hats(x[p], grids.inv_dx), q, run(at[0], True))
 
     @wp.kernel(module=module, enable_backward=False)
     def average(
@@ -222,7 +222,7 @@ def mean_volume_kernels(scalar, slots: int, exact: bool = False) -> SimpleNamesp
                 more[moduli[1]] = more[moduli[1]] + of_bulk
                 more[mu] = more[mu] + two_thirds * of_bulk
             adj_parameters[p] = more
-        spread(adj_nodes, at, f, vec3(of_mean, zero, zero), run(at[0], True, 8))
+        spread(adj_nodes, at, f, vec3(of_mean, zero, zero), run(at[0], True))
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_collect(

@@ -24,6 +24,8 @@ from mosa.physics.memory_sums import added
 
 Together = wp.types.vector(length=5, dtype=int)
 """What `run` tells a thread of those around it."""
+STEPS, STEPS_OF_TWO = 3, 2
+"""In which threads of a run add up: eights, and fours of threads with two particles each."""
 
 
 def _either(cuda: str, cpu: str) -> str:
@@ -47,9 +49,9 @@ STORE = {
     pairs[1] = make_double2(z, w);""",
 }
 
-# x: index of the lowest node, -1: takes no part; groups: threads that add up, a power of two; -> (threads here, place in the run of
-# those with the same x, how many come after; of the first of a group: the first of the one before, if that has x - 1, else -1, and
-# whether no group after it takes over its terms)
+# x: index of the lowest node, -1: takes no part; -> (threads here, place in the run of those with the same x, how many come after;
+# of the first of GROUP threads that add up: the first of those before, if that has x - 1, else -1, and whether none after it
+# takes over its terms)
 RUN = """
     const unsigned mask = __activemask(), lane = threadIdx.x & 31;
     const int before = __shfl_up_sync(mask, x, 1);
@@ -58,7 +60,7 @@ RUN = """
     const unsigned upto = (2u << lane) - 1, later = starts & ~upto;
     const int end = later ? __ffs(later) - 1 : 32;
     const int own = lane, place = own - 31 + __clz(starts & upto);
-    const bool adds = x != -1 && place % groups == 0;
+    const bool adds = x != -1 && place % GROUP == 0;
     const unsigned adding = __ballot_sync(mask, adds), earlier = adding & upto >> 1, next = adding & ~upto;
     const int last = earlier ? 31 - __clz(earlier) : own, there = __shfl_sync(mask, x, last);
     const bool follows = adds && earlier && there == x - 1;
@@ -203,16 +205,16 @@ PARTS = "const auto x = value.c[0], y = value.c[1], z = value.c[2], w = {};"
 
 @cache
 def node_access(scalar) -> SimpleNamespace:
-    """load4, load3, store3, store4, run, add3, add4, meeting, add4_of_two, clear on arrays of 4-vectors of wp.float32 or
-    wp.float64, take3, take33, put3, put33 on those of particles' vectors and matrices.
+    """load4, load3, store3, store4, run, run_of_two, add3, add4, meeting, add4_of_two, clear on arrays of 4-vectors of wp.float32
+    or wp.float64, take3, take33, put3, put33 on those of particles' vectors and matrices.
 
     load(field, i), for memory that nothing in the same launch writes; store(field, i, value), for memory that nothing in the same
-    launch reads; clear(field, i); add(field, i, a, b, c, together), to i, i + 1 and i + 2, for the same, together = run(x, True, 8)
+    launch reads; clear(field, i); add(field, i, a, b, c, together), to i, i + 1 and i + 2, for the same, together = run(x, True)
     of a number x that tells to which i a thread adds, one after the other, -1 where to none. The functions on 3-vectors leave the
     fourth number out; a store sets it to 0. take(field, i) as load; put(field, i, value) stores for the thread's own number i, in
     blocks of whole warps.
     Of two particles a thread, on a GPU, where no thread may leave before: add4_of_two(field, first, i, a, b, c, d, e, f,
-    meeting(x, y), run(y, x == y, 4)), a, b and c to `first` and the two after it, d, e and f to `i`.
+    meeting(x, y), run_of_two(y, x == y)), a, b and c to `first` and the two after it, d, e and f to `i`.
     Where `on_cpu()`: scatter adds what a particle sends (`Sent`) to its 27 nodes, of which `i` is the lowest; gather gives the rows
     v, cx, cy, cz of `g2p`, of theirs."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
@@ -246,8 +248,14 @@ def node_access(scalar) -> SimpleNamespace:
     @wp.func_native(own(PUT, "field.data[i] = value;", 9))
     def put33(field: field33, i: int, value: mat33): ...
 
-    @wp.func_native(_either(RUN, "return {};"))
-    def run(x: int, joins: bool, groups: int) -> Together: ...
+    def run_of(steps: int) -> str:
+        return _either(RUN, "return {};").replace("GROUP", str(1 << steps))
+
+    @wp.func_native(run_of(STEPS))
+    def run(x: int, joins: bool) -> Together: ...
+
+    @wp.func_native(run_of(STEPS_OF_TWO))
+    def run_of_two(x: int, joins: bool) -> Together: ...
 
     @wp.func_native(_either(MEETING, "return {0, 0, 0};"))
     def meeting(x: int, y: int) -> wp.vec3i: ...
@@ -271,13 +279,13 @@ def node_access(scalar) -> SimpleNamespace:
     @wp.func_native(_either(f"{three} {STORE[scalar]}", f"{three} field.data[i] = {{x, y, z, w}};"))
     def store3(field: field4, i: int, value: vec3): ...
 
-    @wp.func_native(add_row(ONLY, 4, 3))
+    @wp.func_native(add_row(ONLY, 4, STEPS))
     def add4(field: field4, i: int, a: vec4, b: vec4, c: vec4, together: Together): ...
 
-    @wp.func_native(add_row(ONLY, 3, 3))
+    @wp.func_native(add_row(ONLY, 3, STEPS))
     def add3(field: field4, i: int, a: vec3, b: vec3, c: vec3, together: Together): ...
 
-    @wp.func_native(add_row(FIRST, 4, 2, cpu=""))
+    @wp.func_native(add_row(FIRST, 4, STEPS_OF_TWO, cpu=""))
     def add4_of_two(
         field: field4, first: int, i: int, a: vec4, b: vec4, c: vec4, d: vec4, e: vec4, f: vec4,
         meeting: wp.vec3i, together: Together,
@@ -310,8 +318,8 @@ def node_access(scalar) -> SimpleNamespace:
         store4(field, i, vec4(z, z, z, z))
 
     return SimpleNamespace(
-        load4=load4, load3=load3, store4=store4, store3=store3, run=run, meeting=meeting, add4=add4, add3=add3,
-        add4_of_two=add4_of_two, clear=clear, take3=take3, take33=take33, put3=put3, put33=put33,
+        load4=load4, load3=load3, store4=store4, store3=store3, run=run, run_of_two=run_of_two, meeting=meeting,
+        add4=add4, add3=add3, add4_of_two=add4_of_two, clear=clear, take3=take3, take33=take33, put3=put3, put33=put33,
         on_cpu=on_cpu, scatter=scatter, gather=gather,
     )  # fmt: skip
 
@@ -326,7 +334,7 @@ def exact_node_access(scalar) -> SimpleNamespace:
     add_exactly, total, clear = functions.add_exactly, functions.total, functions.clear
 
     @wp.func
-    def run(x: int, joins: bool, groups: int):
+    def run(x: int, joins: bool):
         return Together()
 
     def add(numbers: int):

@@ -41,7 +41,8 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
     adding = exact_node_access(scalar) if exact else memory
     run, add3, add4 = adding.run, adding.add3, adding.add4
     take3, take33, put3, put33 = memory.take3, memory.take33, memory.put3, memory.put33
-    meeting, add4_of_two, twice = memory.meeting, memory.add4_of_two, each == 2
+    meeting, run_of_two, add4_of_two = memory.meeting, memory.run_of_two, memory.add4_of_two
+    twice = each == 2
     on_cpu, scatter, gather = memory.on_cpu, memory.scatter, memory.gather
     settle_node = exact_node_access(scalar).settle_node
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
@@ -186,7 +187,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
             s = sent(own, p, now, grids, dt, check_J, substep, flags)
             r = sent(other, p + 1, now, grids, dt, check_J, substep, flags)
             who = meeting(s.n, r.n)
-            together = run(r.n, s.n == r.n, 4)
+            together = run_of_two(r.n, s.n == r.n)
             for i in range(3):
                 for j in range(3):
                     a, b, c = row_of(s, i, j)
@@ -202,7 +203,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
                 if on_cpu():
                     scatter(grid, s.n, s.dims, s.wx, s.wy, s.wz, s.q0, s.bx, s.by, s.bz, s.m)
                     return
-            together = run(s.n, True, 8)
+            together = run(s.n, True)
             for i in range(3):
                 for j in range(3):
                     a, b, c = row_of(s, i, j)
@@ -297,7 +298,7 @@ def transfer_kernels(scalar, exact: bool = False, each: int = 1) -> SimpleNamesp
         dims = grids.windows[place + 1]
         if n < 0:
             return
-        together = run(n, True, 8)
+        together = run(n, True)
         f = xp * grids.inv_dx - base
         wx = spline(f[0])
         wy = spline(f[1])

@@ -28,7 +28,7 @@ def kernel_of(dtype):
         memory.store3(stored3, i, memory.load3(source, i))
         if index[i] < 0:
             return
-        together = memory.run(index[i], True, 8)
+        together = memory.run(index[i], True)
         a = memory.load4(source, i)
         b = memory.load3(source, i)
         memory.add4(added4, index[i], a, scalar(2.0) * a, scalar(3.0) * a, together)
